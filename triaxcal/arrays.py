@@ -11,6 +11,9 @@ Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+READING_MOST = 1e100
+"""Squares of readings, and sums of them, have to be numbers too."""
+
 Numbers = TypeVar("Numbers", Floats, Ints)
 
 

@@ -9,11 +9,9 @@ here.
 from __future__ import annotations
 
 import hashlib
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -34,11 +32,13 @@ from triaxcal.rounding import error, number
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
-from triaxcald.computer import compute_with_one_thread, computer
+from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
+from triaxcald.software import drawn_with as drawn_with
+from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
 
 DAY_S = 86_400
@@ -117,23 +117,6 @@ def certify(
         "registers": _registers_document(image, held, loop, poses, stated) if image and held else None,
     }
     return Certified(document, loop, image, not outside)
-
-
-def drawn_with() -> dict[str, str]:
-    """Versions of what draws a report, which other versions draw otherwise;
-    known without loading it, since a recorder draws nothing."""
-    return {"matplotlib": version("matplotlib"), "jinja2": version("jinja2")}
-
-
-def software() -> dict[str, str]:
-    """Versions of what computes the numbers, and the computer that does."""
-    return {
-        "triaxcal": version("triaxcal"),
-        "numpy": version("numpy"),
-        "scipy": version("scipy"),
-        "python": platform.python_version(),
-        **computer(),
-    }
 
 
 def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:

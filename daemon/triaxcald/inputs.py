@@ -34,19 +34,17 @@ from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
 from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
-from triaxcald.recording.schema import RECOVERY_RECORD, STATION_FILE, Phase
+from triaxcald.recording.schema import CALIBRATION as CALIBRATION
+from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, Phase
+from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
 from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
-PROFILE = "profile.toml"
-"""Name under which a recording carries the profile; the files it names stand
-beside it under ``profile/``."""
+PROFILE = PROFILE_FILE
 UNKNOWN_NOISE = "unknown_noise"
-CALIBRATION: Phase = "calibration"
-VERIFICATION: Phase = "verification"
 
 
 @dataclass(frozen=True)
@@ -205,15 +203,6 @@ def signs_of(recording: Contents) -> tuple[int, int, int] | None:
     if len(parts) != 3 or any(p not in ("1", "-1") for p in parts):
         return None
     return int(parts[0]), int(parts[1]), int(parts[2])
-
-
-def preview_channels(profile: Profile) -> list[str]:
-    """Auxiliary channels that the previews of a recording have beside the three
-    outputs."""
-    names: dict[str, None] = {}
-    for stream in profile.streams.values():
-        names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
-    return list(names)
 
 
 def losses_of(recording: Contents) -> list[str]:

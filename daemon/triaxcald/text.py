@@ -6,12 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from triaxcal.number_format import micro_g, number_of
-from triaxcald.provision.plausible import Doubt
-from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
+
+if TYPE_CHECKING:
+    from triaxcald.provision.plausible import Doubt
+    from triaxcald.provision.procedure import Provisioning
 
 _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
     (DeviceState.UNTOUCHED, None): "no register was written",

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 
 TICK_S = 0.02
 """The loop is looked at so often: some ten times in the shortest time-out that
@@ -24,18 +24,23 @@ MOST_S = 0.05
 late, so that nothing is lost there."""
 
 
+IDLE_TICK_S, IDLE_MOST_S = 0.1, 0.13
+"""The same while nobody waits for anything: nothing can run out then, and a
+recorder that is given one batch after the other wakes up for them alone."""
+
+
 class Looks:
     """Sums the time between looks, each interval no more than ``most_s``. Pure:
     time is an argument [s]."""
 
     def __init__(self, now_s: float, most_s: float) -> None:
-        self._most_s = most_s
+        self.most_s = most_s
         self._looked = now_s, 0.0  # one value, so that another thread sees both or neither
 
     def at(self, now_s: float) -> float:
         """What has been counted by now, without a look."""
         looked_s, counted_s = self._looked
-        return counted_s + min(max(now_s - looked_s, 0.0), self._most_s)
+        return counted_s + min(max(now_s - looked_s, 0.0), self.most_s)
 
     def look(self, now_s: float) -> float:
         counted_s = self.at(now_s)
@@ -56,6 +61,8 @@ class Attention:
         self._looks = Looks(loop.time(), MOST_S)
         self._closed = False
         self._running: dict[asyncio.Timeout, float] = {}
+        self._threads = 0  # that wait
+        self._idle = False
         self._next = loop.call_later(TICK_S, self._tick)
 
     def now_s(self) -> float:
@@ -75,6 +82,7 @@ class Attention:
         counts as in time."""
         async with asyncio.timeout(None) as inner:
             self._running[inner] = self.now_s() + seconds
+            self._wake()
             if self._closed:
                 self._expire(math.inf)
             try:
@@ -82,9 +90,28 @@ class Attention:
             finally:
                 self._running.pop(inner, None)
 
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """While another thread waits by `now_s`."""
+        self._threads += 1
+        with suppress(RuntimeError):  # the loop has ended
+            self.loop.call_soon_threadsafe(self._wake)
+        try:
+            yield
+        finally:
+            self._threads -= 1
+
     def _tick(self) -> None:
         self._expire(self._looks.look(self.loop.time()))
-        self._next = self.loop.call_later(TICK_S, self._tick)
+        self._idle = not self._running and not self._threads
+        self._looks.most_s = IDLE_MOST_S if self._idle else MOST_S
+        self._next = self.loop.call_later(IDLE_TICK_S if self._idle else TICK_S, self._tick)
+
+    def _wake(self) -> None:
+        """Somebody waits: the loop is looked at often again."""
+        if self._idle and not self._closed:
+            self._next.cancel()
+            self._tick()
 
     def _expire(self, now_s: float) -> None:
         for timeout in [t for t, due_s in self._running.items() if not due_s > now_s]:

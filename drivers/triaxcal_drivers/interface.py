@@ -141,12 +141,13 @@ class RawBatch:
     @staticmethod
     def of(records: Sequence[tuple[int, int, int, bytes]]) -> RawBatch:
         """From (time_ns, source, flags, data) records."""
+        time_ns, source, flags, data = zip(*records, strict=True) if records else ((), (), (), ())
         return RawBatch(
-            np.array([r[0] for r in records], dtype=np.int64),
-            np.array([r[1] for r in records], dtype=np.uint32),
-            np.array([r[2] for r in records], dtype=np.uint8),
-            np.array([len(r[3]) for r in records], dtype=np.uint16),
-            b"".join(r[3] for r in records),
+            np.array(time_ns, dtype=np.int64),
+            np.array(source, dtype=np.uint32),
+            np.array(flags, dtype=np.uint8),
+            np.array([*map(len, data)], dtype=np.uint16),
+            b"".join(data),
         )
 
 

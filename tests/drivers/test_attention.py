@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.drivers.virtual_time import VirtualLoop, run, virtual
-from triaxcal_drivers.attention import MOST_S, TICK_S, Attention, Looks
+from triaxcal_drivers.attention import IDLE_TICK_S, MOST_S, TICK_S, Attention, Looks
 
 HELD_UP_S = 30.0
 
@@ -105,3 +105,39 @@ def test_where_nobody_looks_any_more_every_time_out_has_run_out() -> None:
     assert attention.now_s() < math.inf
     loop.close()
     assert attention.now_s() == math.inf
+
+
+def test_while_nobody_waits_the_loop_wakes_up_seldom_and_the_clock_goes_on_all_the_same() -> None:
+    async def work() -> tuple[int, float]:
+        loop, attention, turns = virtual(), Attention(asyncio.get_running_loop()), [0]
+        tick = attention._tick
+
+        def counted() -> None:
+            turns[0] += 1
+            tick()
+
+        attention._tick = counted  # type: ignore[method-assign]
+        begun_s, shown_s = loop.time(), attention.now_s()
+        await asyncio.sleep(10.0)
+        assert attention.now_s() - shown_s == pytest.approx(loop.time() - begun_s, abs=IDLE_TICK_S)
+        idle = turns[0]
+        with attention.watched():
+            await asyncio.sleep(10.0)
+        return idle, turns[0] - idle
+
+    idle, watched = run(work())
+    assert idle == pytest.approx(10.0 / IDLE_TICK_S, abs=3)
+    assert watched == pytest.approx(10.0 / TICK_S, abs=3)
+
+
+def test_a_time_out_that_begins_while_the_loop_wakes_up_seldom_is_as_exact_as_any() -> None:
+    async def work() -> float:
+        loop, attention = virtual(), Attention(asyncio.get_running_loop())
+        await asyncio.sleep(10.03)
+        begun_s = loop.time()
+        with pytest.raises(TimeoutError):
+            async with attention.timeout(0.2):
+                await asyncio.Event().wait()
+        return loop.time() - begun_s
+
+    assert 0.2 <= run(work()) <= 0.2 + 2 * TICK_S

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS, Profile
 from triaxcald.audit.differences import Difference, Kind
-from triaxcald.inputs import preview_channels
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import PREVIEWS, Decimator, PreviewEncoder
+from triaxcald.recording.schema import PREVIEWS, Decimator, PreviewEncoder, preview_channels
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import io
 import sys
 from collections.abc import Callable, Sequence
@@ -81,6 +82,9 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
             from triaxcald.computer import compute_with_one_thread
 
             compute_with_one_thread()
+        if not gc.isenabled():  # as the program begins
+            gc.freeze()
+            gc.enable()
         code: int = command(chosen)
         return code
 

@@ -3,6 +3,7 @@ each failure owes."""
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -24,6 +25,7 @@ def entry() -> NoReturn:
     _open_what_is_closed()
     heed_stop_signals()
     _keep_from_python_can()
+    gc.disable()  # until the command has what it works with: modules are no garbage
     try:
         from triaxcald.cli.commands import main
 
@@ -76,6 +78,7 @@ def _end(code: int) -> NoReturn:
         thread.join(max(0.0, until_s - time.monotonic()))
     if any(thread.is_alive() for thread in others):
         os._exit(code)
+    gc.freeze()  # the end looks for garbage, in a tenth of a second, where all of it goes
     sys.exit(code)
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import time
-from collections.abc import Callable, Collection, Sequence
-from contextlib import AsyncExitStack, nullcontext, suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,10 @@ from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
+from triaxcald.decoded import beside_samples
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DISK, INTERRUPTED, severest
 from triaxcald.files import require_new, require_recording, unused
-from triaxcald.pipeline import beside_samples
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
@@ -40,6 +41,11 @@ if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
 AGAIN_S = 60.0
 """What a full disk ended begins again so often while others go on: it may have
 been cleared meanwhile."""
+
+
+GARBAGE_LEAST = 10_000
+"""Objects more than before after which garbage is looked for. Python's 700 come
+several times a second on a busy bus, hardly ever with a cycle among them."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,11 @@ class _Chosen:
 
 
 def record_command(a: argparse.Namespace) -> int:
+    with _little_garbage():
+        return _recorded(a)
+
+
+def _recorded(a: argparse.Namespace) -> int:
     a.folder = a.output.is_dir()
     if not a.folder:
         writable(a.output)
@@ -74,6 +85,20 @@ def record_command(a: argparse.Namespace) -> int:
         kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if a.folder else None)
     # None is left where it was stopped in the midst of a reload.
     return severest(k.exit_code for k in kept) if kept else INTERRUPTED
+
+
+@contextmanager
+def _little_garbage() -> Iterator[None]:
+    """What has been imported is not looked through for garbage, and the rest
+    seldom."""
+    thresholds = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(GARBAGE_LEAST, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
 
 
 def _load(a: argparse.Namespace) -> _Chosen:
@@ -127,7 +152,7 @@ async def _reload(
     """The station file, each time that it is asked for. What is as it was goes
     on; what ended, for whatever reason, begins again. What the disk ended does
     so now and then by itself."""
-    from triaxcald.run.endings import reason_of, trace_of
+    from triaxcald.run.reasons import reason_of, trace_of
 
     while True:
         asked = await _is_set(hangup, AGAIN_S)
@@ -234,8 +259,7 @@ def _of_buses(
 
 def _segments(a: argparse.Namespace) -> Segments | None:
     """Where anything about them was said."""
-    from triaxcald.recording.retention import Retention
-    from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S
+    from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
     from triaxcald.run.session import Segments
 
     if all(given is None for given in (a.segment_size, a.segment_time, a.keep, a.keep_free)):

@@ -14,15 +14,15 @@ from typing import Any
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import Decoder, RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
-from triaxcald.certificate import software
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
 from triaxcald.imports.times import Times
-from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
+from triaxcald.inputs import CALIBRATION, PROFILE
 from triaxcald.pipeline import only_finite
 from triaxcald.recording import disk
-from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
+from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic, preview_channels
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.software import versions
 
 BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one
 BATCH_BYTES = 2**20  # of their data; a chunk of a recording may have 16 MiB
@@ -127,7 +127,7 @@ def _write(
     unit = {"name": bundle.profile.name, "serial": "", "signs": ",".join(map(str, signs)) if signs else ""}
     with RecordingWriter(
         temporary,
-        metadata={"unit": unit, "software": software(), "import": {"file": source.name}},
+        metadata={"unit": unit, "software": versions(), "import": {"file": source.name}},
         preview_channels=preview_channels(bundle.profile),
         preview_unit=bundle.profile.output.unit,
         clock_ns=clock,

@@ -19,7 +19,10 @@ from triaxcald.recording import disk, schema
 from triaxcald.recording.inventory import Document, Inventory
 from triaxcald.recording.raw_batch import encode_raw
 
-CHUNK_NS = 1_000_000_000  # no record waits longer than this for the operating system to have it
+CHUNK_NS = 1_000_000_000
+"""After so long the operating system has a record. Counted from when it was
+received, where that was now: a kill takes no more than a second."""
+RECENT_NS = 1_000_000_000  # received longer ago, it is from a log, or the clock was set
 FLUSH_BYTES = 2**20  # nor more of the file than this
 SYNC_S = 10.0
 """So much a loss of power may take away. An fsync of a slow disk takes tenths of
@@ -93,6 +96,9 @@ class RecordingFile:
     def raw(self, phase: str, first: int, batch: RawBatch) -> None:
         if self._begun_ns is not None and len(batch):
             self._tell_begun(min(self._begun_ns, int(batch.time_ns.min())))
+        if len(batch) and self._waiting_ns is None:
+            now_ns, received_ns = self._clock_ns(), int(batch.time_ns[0])
+            self._waiting_ns = received_ns if 0 <= now_ns - received_ns < RECENT_NS else now_ns
         for piece in schema.cut(batch):
             time_ns = int(piece.time_ns[-1]) if len(piece) else self._clock_ns()
             self._add(schema.RAW, time_ns, encode_raw(first, phase, piece))
@@ -143,6 +149,13 @@ class RecordingFile:
 
     def require_there(self) -> None:
         disk.require_there(self._file.fileno())
+
+    @property
+    def due_s(self) -> float | None:
+        """In how long a flush is due, by the clock; None where nothing waits."""
+        if self._waiting_ns is None:
+            return None
+        return max(0.0, (self._waiting_ns + CHUNK_NS - self._clock_ns()) * 1e-9)
 
     def flush_when_due(self) -> bool:
         """Whether it was."""

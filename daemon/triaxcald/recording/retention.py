@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, NamedTuple
 
-from triaxcal_drivers.files import read_whole
 from triaxcald.recording.manifest import Manifest, Segment
 
-EVIDENCE = ("*.outcome.json", "*.certificate.json")
-"""Documents that may rest on a recording."""
-EVIDENCE_MOST = 4 * 2**20  # bytes of one, as for any document
+SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
+"""What damage to one file costs at most, and the least that retention takes: an
+hour of a busy bus is some hundred MiB."""
 Reason = Literal["age", "disk"]
 
 
@@ -61,36 +58,6 @@ def surplus(
 
 def _too_old(age_ns: int | None, keep_s: float) -> bool:
     return age_ns is None or age_ns > keep_s * 1e9
-
-
-class Evidence(NamedTuple):
-    """``kept`` are files that stay; ``unread`` is the document that may name any
-    of them."""
-
-    kept: frozenset[str]
-    unread: str | None = None
-
-
-def evidence(manifest: Manifest) -> Evidence:
-    """The files that an outcome or a certificate beside the manifest names, by
-    name or by digest; all, where such a document cannot be read, and which that
-    is."""
-    texts = []
-    for pattern in EVIDENCE:
-        for path in manifest.path.parent.glob(pattern):
-            try:
-                texts.append((path.name, read_whole(path, EVIDENCE_MOST).decode("utf-8", "replace")))
-            except OSError:
-                if not os.path.lexists(path):  # it has just gone
-                    continue
-                return Evidence(frozenset(s.file for s in manifest.segments), path.name)
-    return Evidence(frozenset(s.file for s in manifest.segments if _is_named(s, texts)))
-
-
-def _is_named(segment: Segment, texts: Iterable[tuple[str, str]]) -> bool:
-    stem = Path(segment.file).stem
-    told = [name for name in (segment.file, segment.sha256, segment.raw_sha256) if name]
-    return any(name.startswith(f"{stem}.") or any(t in text for t in told) for name, text in texts)
 
 
 def delete(manifest: Manifest, chosen: Iterable[Surplus]) -> list[Surplus]:

@@ -22,6 +22,7 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcal_drivers.profile import Profile
 
 FORMAT = "triaxcal.recording/1"
 FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_WITH where it is of a run
@@ -34,9 +35,14 @@ BUS_RECORD = "bus"  # the metadata record that takes the place of `unit` where a
 SEGMENT_RECORD = "segment"  # the metadata record that says which part of a longer recording this is
 UNCONFIRMED = "unconfirmed"  # the metadata record, and event, that says which records are of nobody known
 STATION_FILE = "station.toml"  # the attachment with the station file
+PROFILE_FILE = "profile.toml"
+"""Name under which a recording carries the profile; the files it names stand
+beside it under ``profile/``."""
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
 Phase = Literal["calibration", "verification"]
+CALIBRATION: Phase = "calibration"
+VERIFICATION: Phase = "verification"
 BUS_PHASE = "bus/"  # begins the phases of a bus recording, one for each channel
 PreviewTopic = Literal["/preview/readings", "/preview/corrected"]
 Operation = Literal["read", "write"]
@@ -170,6 +176,15 @@ def preview_schema(channels: Sequence[str]) -> Schema:
     vector = [("time_ns", _F.TYPE_FIXED64, False)] + [(axis, _F.TYPE_DOUBLE, False) for axis in "xyz"]
     named = [(field, _F.TYPE_DOUBLE, False) for field in preview_fields(channels)]
     return _schema("Preview", vector + named)
+
+
+def preview_channels(profile: Profile) -> list[str]:
+    """Auxiliary channels that the previews of a recording have beside the three
+    outputs."""
+    names: dict[str, None] = {}
+    for stream in profile.streams.values():
+        names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
+    return list(names)
 
 
 def preview_fields(channels: Sequence[str]) -> list[str]:

@@ -16,17 +16,17 @@ from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
+from triaxcald.recording.evidence import evidence_in
 from triaxcald.recording.file import Head, RecordingFile
 from triaxcald.recording.inventory import Document
 from triaxcald.recording.manifest import Manifest, Segment, manifest_path
 from triaxcald.recording.rebuild import open_manifest, settled
-from triaxcald.recording.retention import Retention, Surplus, delete, evidence, surplus
+from triaxcald.recording.retention import SEGMENT_BYTES as SEGMENT_BYTES
+from triaxcald.recording.retention import SEGMENT_S as SEGMENT_S
+from triaxcald.recording.retention import Retention, Surplus, delete, surplus
 from triaxcald.recording.series import digest_of
 from triaxcald.recording.writer import RecordingWriter
 
-SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
-"""What damage to one file costs at most, and the least that retention takes: an
-hour of a busy bus is some hundred MiB."""
 REBUILT = "manifest_rebuilt"  # an event
 AWAY = "nothing was being recorded meanwhile"
 DAMAGED = "what was recorded before is damaged, and nothing was being recorded meanwhile"
@@ -62,6 +62,7 @@ class SegmentedWriter(RecordingWriter):
         self.deleted: list[Surplus] = []
         self._size_bytes, self._time_ns = size_bytes, round(time_s * 1e9)
         self._retention, self._steady_ns = retention, steady_ns
+        self._evidence = evidence_in(self.manifest.parent)
         self._began_ns = self._retained_ns = steady_ns()
         self._closed_ns: dict[int, int] = {}  # by number, on the steady line
         self._kept: list[tuple[int, str, str, bytes]] = []
@@ -220,7 +221,7 @@ class SegmentedWriter(RecordingWriter):
         self._retained_ns = self._steady_ns()
         if self._retention is None:
             return []
-        kept, unread = evidence(self._segments)
+        kept, unread = self._evidence.of(self._segments)
         choose = partial(
             surplus, self._segments.segments, self._retention, age_ns=self._age_ns,
             free_bytes=disk.free_bytes(self.manifest.parent),

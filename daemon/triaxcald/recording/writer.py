@@ -25,8 +25,8 @@ from triaxcald.recording.file import SYNC_S, Head, RecordingFile
 from triaxcald.recording.inventory import Document
 
 LOOK_S = 1.0
-"""A writer that is given nothing looks about so often: what was written is due
-to the operating system by then, and a segment grows old in silence too."""
+"""A writer that is given nothing looks about so often, since a segment grows old
+in silence too; sooner where what was written is due to the operating system."""
 
 BEHIND_S = 5.0
 """A disk that is a little slower than the bus costs a batch now and then: so
@@ -325,7 +325,8 @@ class RecordingWriter:
     def _next_job(self) -> Callable[[], None] | None:
         while True:
             try:
-                return self._jobs.get(timeout=LOOK_S)
+                due_s = self._file.due_s
+                return self._jobs.get(timeout=LOOK_S if due_s is None else min(LOOK_S, due_s))
             except queue.Empty:
                 self._idle()
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from triaxcald import text
-from triaxcald.certificate import software
 from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.schema import BUS_RECORD, STATION_FILE
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.recording import AtRecording, State
 from triaxcald.run.session import Segments, new_writer, stamp
+from triaxcald.software import versions
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience
@@ -80,7 +80,7 @@ class BusRecording(AtRecording):
             "metadata": {
                 "station": {"name": self._station.file.name},
                 BUS_RECORD: bus_record(bus.interface, bus.channel, **told),
-                "software": software(),
+                "software": versions(),
             },
             "preview_channels": None,
             "clock_ns": self._clock_ns,

@@ -5,18 +5,15 @@ from __future__ import annotations
 
 import asyncio
 import sys
-import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from triaxcal.errors import TriaxcalError
 from triaxcal.interchange.calibration_document import Document
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, DriverError, SecondAnswer
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, SecondAnswer
 from triaxcald import exit_codes, text
 from triaxcald.certificate import exceeded
 from triaxcald.errors import (
-    DaemonError,
     DeviceInUse,
     DiskError,
     Implausible,
@@ -26,13 +23,16 @@ from triaxcald.errors import (
     TwoAnswer,
 )
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
-from triaxcald.memory import out_of_memory, ran_out_of_memory
+from triaxcald.memory import ran_out_of_memory
 from triaxcald.outcome import Code, Ending, Verdict
 from triaxcald.printable import printable_lines
 from triaxcald.provision.correction import ReadingsNotStated
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
+from triaxcald.run.reasons import is_internal
+from triaxcald.run.reasons import reason_of as reason_of
+from triaxcald.run.reasons import trace_of as trace_of
 from triaxcald.station.config import Limits
 from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
 from triaxcald.verification import WORSE
@@ -89,7 +89,7 @@ def code_of(e: BaseException) -> Code | None:
         for kind, code in _CODES:
             if isinstance(cause, kind):
                 return code
-    if _internal(e):
+    if is_internal(e):
         return Code.INTERNAL
     match exit_code_of(e):
         case exit_codes.REFUSED:
@@ -115,22 +115,3 @@ _CODES: tuple[tuple[type[BaseException], Code], ...] = (
     (BusError, Code.LOST),
 )
 """In the order in which they are looked for."""
-
-
-def reason_of(e: BaseException) -> str:
-    """Of an end before its time, in one line."""
-    if isinstance(e, asyncio.CancelledError):
-        return "interrupted"
-    if _internal(e) and ran_out_of_memory(e):
-        return out_of_memory(e)
-    return f"internal error: {e!r}" if _internal(e) else str(e) or type(e).__name__
-
-
-def trace_of(e: BaseException) -> str | None:
-    """Where an internal error came from, for who mends it; None of any other."""
-    internal = _internal(e) and not ran_out_of_memory(e)
-    return "".join(traceback.format_exception(e)) if internal else None
-
-
-def _internal(e: BaseException) -> bool:
-    return not isinstance(e, (TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))

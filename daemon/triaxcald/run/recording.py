@@ -20,7 +20,7 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
-from triaxcald.run.endings import reason_of, trace_of
+from triaxcald.run.reasons import reason_of, trace_of
 from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience

@@ -12,16 +12,14 @@ from typing import Any
 
 from triaxcal_drivers.interface import Device
 from triaxcald import text
-from triaxcald.certificate import drawn_with, software
 from triaxcald.errors import InputError
-from triaxcald.inputs import PROFILE, preview_channels
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity, identified
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
-from triaxcald.recording.retention import Retention
-from triaxcald.recording.schema import STATION_FILE
-from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
+from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
+from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.coming_back import HOLE_S, Patience, Returning, Streaming
 from triaxcald.station.config import Place, Station
@@ -42,9 +40,11 @@ class Segments:
 def new_writer(path: Path, segments: Segments | None, **settings: Any) -> RecordingWriter:
     """With ``settings`` of a `RecordingWriter`, in segments where they are
     given. Raises RecordingError."""
-    return (
-        RecordingWriter(path, **settings) if segments is None else SegmentedWriter(path, **settings, **vars(segments))
-    )
+    if segments is None:
+        return RecordingWriter(path, **settings)
+    from triaxcald.recording.segments import SegmentedWriter  # which reads recordings too
+
+    return SegmentedWriter(path, **settings, **vars(segments))
 
 
 def stamp(time_ns: int) -> str:
@@ -153,7 +153,7 @@ class UnitSession:
             "metadata": {
                 "station": {"name": self.station.file.name},
                 "unit": unit,
-                "software": {**software(), **drawn_with()},
+                "software": {**(software() if ends_with else versions()), **drawn_with()},
             },
             "preview_channels": preview_channels(self.profile),
             "preview_unit": self.profile.output.unit,
@@ -163,7 +163,7 @@ class UnitSession:
             settings["ends_with"] = ends_with
         writer = new_writer(path, segments, **settings)
         writer.attach(STATION_FILE, "application/toml", self.station.text)
-        writer.attach(PROFILE, "application/toml", self.place.bundle.text)
+        writer.attach(PROFILE_FILE, "application/toml", self.place.bundle.text)
         for name, data in self.place.bundle.files.items():
             writer.attach(f"profile/{name}", "application/octet-stream", data)
         return writer

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import READINGS
-from triaxcald.inputs import CALIBRATION
 from triaxcald.provision.identity import IdentityRead
+from triaxcald.recording.schema import CALIBRATION
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.recording import AtRecording, State, UnitStatus
 from triaxcald.run.session import Segments, UnitSession

@@ -6,26 +6,28 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from triaxcal.arrays import Floats
-from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcal_drivers.two_senders import RECORDS
 from triaxcald import text
-from triaxcald.errors import NoPoses, TwoAnswer
-from triaxcald.pipeline import DecodedStream, Pipeline
+from triaxcald.decoded import DecodedStream
+from triaxcald.errors import NoPoses, RecordingError, TwoAnswer
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.raw_records import RawRecords
+
+if TYPE_CHECKING:
+    pass
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the
@@ -38,6 +40,11 @@ RESTARTED_S = 3.0
 SILENCE_SHARE = 0.25
 """Of a silence, what one batch without a sample may add. A device that sends
 brings several in that time."""
+
+
+DECODE_S = 1.0
+"""Records are decoded together so seldom where nobody is guided by them: what
+it costs to decode a batch hardly depends on how many are in it."""
 
 
 class Progress(Protocol):
@@ -62,6 +69,10 @@ class Recorded(RawRecords):
     where: str
     latest: dict[str, float] = field(default_factory=dict, init=False)
     _restarted_ns: int | None = field(default=None, init=False)
+    _undecoded: list[RawBatch] = field(default_factory=list, init=False)
+    _decoded_ns: int | None = field(default=None, init=False)
+    _device: Streaming | None = field(default=None, init=False)
+    _writer: RecordingWriter | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,37 +86,74 @@ class Recorded(RawRecords):
 
     def mark(self) -> dict[str, Any]:
         """What the streams have come to so far, for `back_to`."""
+        self._decode()
         return {name: stream.mark() for name, stream in self.streams.items()}
 
     def back_to(self, mark: dict[str, Any]) -> None:
         """As if nothing had come since. No more records may come."""
+        self._undecoded = []
         for name, stream in self.streams.items():
             stream.back_to(mark[name])
 
-    async def records(self, device: Streaming, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
-        """What comes off the bus, once it is on its way to disk and decoded.
+    async def records(
+        self, device: Streaming, writer: RecordingWriter | None, seconds: float | None = None
+    ) -> AsyncGenerator[RawBatch]:
+        """What comes off the bus, once it is on its way to disk. It is decoded
+        by then or some batches later, but at once where the readings may have
+        come to so many ``seconds``.
 
         What the disk has no room for goes to neither, so that an audit sees
         what the station saw. Raises TwoAnswer where two units send.
         """
         stream = cast(Any, device.stream(list(self.streams)))
         async with aclosing(self.written(stream, writer)) as written:
-            async for batch in written:
-                mixed = None
-                for name, decoded in self.streams.items():
-                    block = decoded.feed(batch)
-                    mixed = name if block.two_senders else mixed
-                    if block.restarts and self._tells_restart(
-                        batch
-                    ):  # what it was told when it was opened is gone, and it may be another unit
-                        device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
-                    if len(block) and name == READINGS:
-                        self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
-                    if writer is not None and len(block):
-                        writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
-                if mixed is not None:  # once all of the batch is in the file
-                    raise TwoAnswer(text.two_senders(self.where, mixed))
-                yield batch
+            self._device, self._writer = device, writer
+            try:
+                async for batch in written:
+                    self._undecoded.append(batch)
+                    if self._is_due(batch, seconds):
+                        self._decode()
+                    yield batch
+            finally:
+                with suppress(RecordingError):  # why it ends, then
+                    self._decode()
+
+    def _is_due(self, batch: RawBatch, seconds: float | None) -> bool:
+        """Whether what has come is to be decoded by now."""
+        if self._decoded_ns is None or not len(batch) or batch.gap is not None:
+            return True
+        # By the host's clock, which nobody promises to run on: back is due too.
+        since_s = (int(batch.time_ns[-1]) - self._decoded_ns) * 1e-9
+        if not 0 <= since_s < self._decode_s:
+            return True
+        if seconds is None:
+            return False
+        readings = self.streams[READINGS]
+        if not readings.host_seconds:  # how fast the unit's own time goes is not known yet
+            return True
+        pace = readings.seconds / readings.host_seconds
+        return readings.seconds + max(pace, 1.0) * since_s >= seconds
+
+    def _decode(self) -> None:
+        """All that waits for it. Raises TwoAnswer if two units send."""
+        if not self._undecoded or self._device is None:
+            return
+        device, writer, mixed = self._device, self._writer, None
+        batch, self._undecoded = RawBatch.joined(self._undecoded), []
+        if len(batch):
+            self._decoded_ns = int(batch.time_ns[-1])
+        for name, decoded in self.streams.items():
+            block = decoded.feed(batch)
+            mixed = name if block.two_senders else mixed
+            # What it was told when it was opened is gone, and it may be another unit.
+            if block.restarts and self._tells_restart(batch):
+                device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
+            if len(block) and name == READINGS:
+                self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
+            if writer is not None and len(block):
+                writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
+        if mixed is not None:  # all of the batch is in the file
+            raise TwoAnswer(text.two_senders(self.where, mixed))
 
     def _tells_restart(self, batch: RawBatch) -> bool:
         """Whether a restart is to be acted upon. Two units that send at once look
@@ -119,10 +167,19 @@ class Recorded(RawRecords):
         return True
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
-        # Twice what the driver waits, which knows better what is the matter
-        # where nothing comes at all.
-        timeout_s = 2 * self.bundle.profile.sampling.silence_timeout_s
-        return _Watch(self.streams[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
+        return _Watch(self.streams[stream], f"{self.where}: stream {stream}", self._timeout_s, clock_s)
+
+    @property
+    def _timeout_s(self) -> float:
+        """Twice what the driver waits, which knows better what is the matter
+        where nothing comes at all."""
+        return 2 * self.bundle.profile.sampling.silence_timeout_s
+
+    @property
+    def _decode_s(self) -> float:
+        """So long records may wait to be decoded together; not so long that a
+        watch looks too seldom."""
+        return min(DECODE_S, SILENCE_SHARE * self._timeout_s)
 
     async def for_seconds(
         self,
@@ -135,24 +192,33 @@ class Recorded(RawRecords):
         None. A device that sends, but no whole reading, hears of it."""
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
-        async with aclosing(self.records(device, writer)) as records:
+        async with aclosing(self.records(device, writer, seconds)) as records:
             async for batch in records:
                 if _interrupted(batch):
                     watch = self._watch(READINGS, clock_s)
+                if self._undecoded:
+                    continue
                 watch.look(device)
                 if seconds is not None and readings.seconds >= seconds:
                     return
 
 
 class Collection(Recorded):
-    """The same, searched for poses on the way."""
+    """The same, searched for poses on the way: whoever turns the unit is told
+    at once."""
 
     def __post_init__(self) -> None:
+        from triaxcald.pipeline import Pipeline  # whoever only records needs none of the metrology
+
         self.pipelines = {s: Pipeline(self.bundle, s) for s in self._names()}
         super().__post_init__()
 
     def _decoded(self, stream: str) -> DecodedStream:
         return self.pipelines[stream]
+
+    @property
+    def _decode_s(self) -> float:
+        return 0.0
 
     async def until_posed(
         self,
@@ -181,6 +247,8 @@ class Collection(Recorded):
         lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
         counted_s: tuple[float, ...] = ()
         if stream == READINGS:
+            from triaxcal.model.directions import directions
+
             directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:

@@ -10,14 +10,12 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
-from triaxcal.effects import CATALOGUE
 from triaxcal.model.gravity import local_gravity_g
 from triaxcal.model.moment import Moment
-from triaxcal.uncertainty import Stated
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of
@@ -33,6 +31,9 @@ from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
 from triaxcald.station.coming_back import Patience, claimed, until_open
+
+if TYPE_CHECKING:
+    from triaxcal.uncertainty import Stated
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -150,6 +151,8 @@ class StationFile(Strict):
     def stated(self, profile: Profile) -> Stated:
         """What the station says of uncertainties, and the device's ``profile``
         of its thermal sensitivity."""
+        from triaxcal.uncertainty import Stated  # the fit and all: no recorder needs it
+
         own = self.thermal_sensitivity_per_k
         return Stated.at(
             self.latitude_deg,
@@ -348,7 +351,10 @@ def _check_roles(bundle: Bundle, *, where: str) -> None:
     """Only the daemon knows the effects, whose coefficients are roles. Raises
     InputError with the nearest one."""
     known = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
-    known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
+    if any(r.role not in (None, *known, *_OTHER_ROLES) for r in bundle.profile.registers.values()):
+        from triaxcal.effects import CATALOGUE  # of a device that holds none, it is not needed
+
+        known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
     known += _OTHER_ROLES
     for name, register in bundle.profile.registers.items():
         if register.role is not None and register.role not in known:

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.model.directions import Direction, directions, elsewhere
-from triaxcal.poses.pose import StillSpan
+
+if TYPE_CHECKING:
+    from triaxcal.model.directions import Direction
+    from triaxcal.poses.pose import StillSpan
 
 COVERED_DEG = 25.0
 """A pose covers the direction of the plan that it is nearest to, up to this far
@@ -92,6 +95,8 @@ def guide(
     found = len(distinct)
     in_all = found + len(others)
     only_near = bool(taken) and found < wanted <= in_all and in_all >= min(2 * wanted, len(taken))
+    from triaxcal.model.directions import directions, elsewhere  # a recorder guides nobody
+
     targets = directions(wanted) if plan else elsewhere(np.array(taken), wanted) if taken else []
     missing = _uncovered(targets, held) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))

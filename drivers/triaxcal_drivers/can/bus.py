@@ -6,22 +6,30 @@ import asyncio
 import sys
 import threading
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import TypeVar
 
 from triaxcal_drivers.can.adapter import Adapter
 from triaxcal_drivers.can.model import BusSettings
-from triaxcal_drivers.can.python_can import PythonCan
 
 T = TypeVar("T")
 
 
 def open_bus(settings: BusSettings) -> Adapter:
-    """Blocking; SocketCAN by a socket of our own, all else by python-can.
+    """Blocking; SocketCAN and multicast by sockets of our own, all else by
+    python-can.
     Raises BusError."""
     if settings.interface == "socketcan" and sys.platform == "linux":
         from triaxcal_drivers.can.socketcan import open_socketcan  # what it imports is Linux' own
 
         return open_socketcan(str(settings.channel), settings.options, settings.bitrate)
+    if settings.interface == "udp_multicast" and sys.platform == "linux" and find_spec("msgpack"):
+        from triaxcal_drivers.can.udp_multicast import OPTIONS, UdpMulticast
+
+        if OPTIONS.issuperset(settings.options):
+            return UdpMulticast(settings)
+    from triaxcal_drivers.can.python_can import PythonCan  # python-can takes a tenth of a second to load
+
     return PythonCan(settings)
 
 

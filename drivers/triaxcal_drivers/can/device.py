@@ -317,7 +317,7 @@ class CanDevice:
         patience_s = self._profile.sampling.reply_timeout_s if timeout_s is None else timeout_s
 
         def locked() -> T:
-            with self._sdo_lock:
+            with self._sdo_lock, connection.line.attention.watched():
                 connection.sdo.RESPONSE_TIMEOUT = patience_s
                 return transfer(connection.sdo)
 

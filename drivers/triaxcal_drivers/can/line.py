@@ -23,6 +23,8 @@ from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawFlag
 
+_SENT, _EXTENDED, _NO_DATA = int(RawFlag.SENT), int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR | RawFlag.REMOTE)
+
 POLL_S = 0.1
 """How long closing waits for the receive thread to look up."""
 JOIN_S = 2.0
@@ -155,7 +157,7 @@ class CanLine:
                     adapter.close()
                 return
             if frames:
-                if not all(frame.flags & RawFlag.SENT for frame in frames):
+                if not all(frame.flags & _SENT for frame in frames):
                     self._heard_s = self.attention.now_s()
                 HOST.steps_ns()
                 if HOST.stepped:
@@ -163,10 +165,9 @@ class CanLine:
                 for queue in self._queues:
                     queue.put(frames, adapter.socketcan_errors)
                 listeners = self._listeners
-                for frame in frames:
-                    extended = bool(frame.flags & RawFlag.EXTENDED_ID)
-                    listener = listeners.get((frame.source, extended))
-                    if listener is not None and not frame.flags & (RawFlag.ERROR | RawFlag.REMOTE):
+                for frame in frames if listeners else ():
+                    listener = listeners.get((frame.source, frame.flags & _EXTENDED != 0))
+                    if listener is not None and not frame.flags & _NO_DATA:
                         listener(frame)
 
 

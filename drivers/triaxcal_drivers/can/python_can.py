@@ -18,6 +18,8 @@ _AT_ONCE = 256
 """Frames that are taken without a pause; more would keep those that wait for
 the first of them."""
 _OFF_CLOCK_NS = 10_000_000_000
+_EXTENDED, _REMOTE, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.REMOTE), int(RawFlag.ERROR)
+_FD, _SWITCHED, _SENT = int(RawFlag.FD), int(RawFlag.BIT_RATE_SWITCH), int(RawFlag.SENT)
 _ECHO = frozenset(("udp_multicast", "gs_usb"))
 """Interfaces that give what they send, asked for or not."""
 
@@ -90,12 +92,12 @@ class PythonCan:
 
     def _frame(self, message: can.Message) -> Frame:
         flags = (
-            RawFlag.EXTENDED_ID * message.is_extended_id
-            | RawFlag.REMOTE * (message.is_remote_frame or message.error_state_indicator)
-            | RawFlag.ERROR * message.is_error_frame
-            | RawFlag.FD * message.is_fd
-            | RawFlag.BIT_RATE_SWITCH * message.bitrate_switch
-            | RawFlag.SENT * (not message.is_rx)
+            _EXTENDED * message.is_extended_id
+            | _REMOTE * (message.is_remote_frame or message.error_state_indicator)
+            | _ERROR * message.is_error_frame
+            | _FD * message.is_fd
+            | _SWITCHED * message.bitrate_switch
+            | _SENT * (not message.is_rx)
         )
         data = bytes(message.dlc) if message.is_remote_frame else bytes(message.data)
         return Frame(self._clock.time_ns(message.timestamp), message.arbitration_id, flags, data)

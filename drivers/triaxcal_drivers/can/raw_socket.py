@@ -26,7 +26,7 @@ STAMPS, STAMPS_OLD = 64, 35  # SO_TIMESTAMPNS: of 64 bits everywhere since Linux
 HARDWARE, HARDWARE_OLD = 65, 37  # SO_TIMESTAMPING likewise
 FILTER, _ERROR_FILTER, _LOOPBACK, OWN, _FD = 1, 2, 3, 4, 5  # CAN_RAW_…, at level SOL_CAN_RAW
 _ALL_ERRORS = 0x1FFF_FFFF
-_BUFFER_BY_FORCE = 33  # SO_RCVBUFFORCE
+BUFFER_BY_FORCE = 33  # SO_RCVBUFFORCE
 _HARDWARE_FLAGS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 6  # stamps of reception, the adapter's as they are and the kernel's
 _NUMBER = struct.Struct("=I")
 
@@ -66,7 +66,7 @@ def make_room(sock: socket.socket, name: str, settings: SocketCanOptions, bitrat
     with suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, half)
         if sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) < size:
-            sock.setsockopt(socket.SOL_SOCKET, _BUFFER_BY_FORCE, half)
+            sock.setsockopt(socket.SOL_SOCKET, BUFFER_BY_FORCE, half)
     given = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     if asked is not None and given < asked:
         raise BusError(

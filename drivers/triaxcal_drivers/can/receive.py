@@ -17,13 +17,16 @@ from triaxcal_drivers.can.error_frame import ErrorClass, error_frame
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 
-BATCH_FRAMES, BATCH_S = 256, 0.05
+BATCH_FRAMES, BATCH_S = 256, 0.2
 CAPACITY = 1 << 16
 """Frames of a unit that wait for the event loop: a whole minute of the fastest
 one."""
 OVERRUN = "this program did not keep up with the bus"
 OVERFLOW = "the receive buffer of the bus overflowed; frames of all its units count"
 CONTROLLER_OVERFLOW = "the receive buffer of the CAN controller overflowed, which counts no frames"
+# Plain numbers: an operation on an enumeration takes longer than all else that is
+# done to a frame.
+_ERROR, _EXTENDED, _LOST_BEFORE = int(RawFlag.ERROR), int(RawFlag.EXTENDED_ID), int(RawFlag.LOST_BEFORE)
 
 
 class _Loss(NamedTuple):
@@ -64,6 +67,8 @@ class FrameQueue:
         self._failure: Exception | None = None
         self._some, self._enough = asyncio.Event(), asyncio.Event()
         self._last_ns: int | None = None
+        self._at_loss = False  # the next frame waits already, for a batch of its own
+        self._flows = False  # the last batch had frames: nobody waits for the first of the next
 
     @property
     def identifiers(self) -> frozenset[Identifier] | None:
@@ -77,6 +82,7 @@ class FrameQueue:
         with self._lock:
             self._frames.clear()
             self._loss, self._failure, self._last_ns = None, None, None
+            self._flows = self._at_loss = False
             self._identifiers = opened = _Every() if identifiers is None else frozenset(identifiers)
         self._some.clear()
         self._enough.clear()
@@ -102,17 +108,17 @@ class FrameQueue:
             for frame in frames:
                 if frame.lost:
                     self._lose(_Loss(frame.lost, OVERFLOW))
-                if frame.flags & RawFlag.ERROR:
+                if frame.flags & _ERROR:
                     self._keep(frame)
                     if (
                         socketcan_errors
                         and ErrorClass.RECEIVE_OVERFLOW in error_frame(frame.source, frame.data).classes
                     ):
                         self._lose(_Loss(None, CONTROLLER_OVERFLOW))
-                elif (frame.source, bool(frame.flags & RawFlag.EXTENDED_ID)) in wanted:
+                elif (frame.source, frame.flags & _EXTENDED != 0) in wanted:
                     self._keep(frame)
             waiting = len(self._frames)
-        if waiting > before == 0:
+        if waiting > before == 0 and not self._flows:
             self._tell(self._some)
         if waiting >= BATCH_FRAMES > before:
             self._tell(self._enough)
@@ -124,7 +130,7 @@ class FrameQueue:
             return
         loss, self._loss = self._loss, None
         if loss is not None:
-            frame = frame._replace(flags=frame.flags | RawFlag.LOST_BEFORE)
+            frame = frame._replace(flags=frame.flags | _LOST_BEFORE)
         self._frames.append((frame, loss))
 
     def _lose(self, loss: _Loss) -> None:
@@ -134,36 +140,52 @@ class FrameQueue:
         """From the receive thread, when receiving has failed."""
         self._failure = failure
         self._tell(self._some)
+        self._tell(self._enough)
 
     def _tell(self, event: asyncio.Event) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended, and nobody is left to be told
             self._attention.loop.call_soon_threadsafe(event.set)
 
     async def batch(self, timeout_s: float) -> RawBatch | None:
-        """The next frames: up to 256, or those of 50 ms, and none beyond the
+        """The next frames: up to 256, or those of 0.2 s, and none beyond the
         next loss. None when nothing comes for ``timeout_s`` of attention.
 
         Raises BusError when receiving has failed.
         """
-        try:
-            async with self._attention.timeout(timeout_s):
-                await self._some.wait()
-        except TimeoutError:
-            if not self._frames:
-                return None
-        if not self._frames and self._failure is not None:
-            raise BusError(str(self._failure)) from self._failure
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(BATCH_S):
-                await self._enough.wait()
+        flowed, self._flows = self._flows, False
+        if flowed and not self._at_loss:  # so that one batch after the other is one wake-up each
+            await self._gathered(min(BATCH_S, timeout_s))
+        with self._lock:  # whoever puts some in from now on tells
+            nothing = not self._frames
+        if nothing:
+            try:
+                async with self._attention.timeout(timeout_s):
+                    await self._some.wait()
+            except TimeoutError:
+                if not self._frames:
+                    return None
+            if not self._frames and self._failure is not None:
+                raise BusError(str(self._failure)) from self._failure
+            await self._gathered(BATCH_S)
+        elif not flowed:
+            await self._gathered(BATCH_S)
+        self._flows = True
         with self._lock:
             taken = self._take()
             left = len(self._frames)
+            self._at_loss = left > 0 and self._frames[0][1] is not None
         if left == 0 and self._failure is None:
             self._some.clear()
         if left < BATCH_FRAMES:
             self._enough.clear()
         return self._batch(taken)
+
+    async def _gathered(self, seconds: float) -> None:
+        """A whole batch, or so long; no longer where receiving has failed."""
+        if self._failure is None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    await self._enough.wait()
 
     def _take(self) -> list[tuple[Frame, _Loss | None]]:
         taken: list[tuple[Frame, _Loss | None]] = []

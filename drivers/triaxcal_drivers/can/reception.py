@@ -33,6 +33,13 @@ class Reception:
         """The kernel counts at a frame's arrival all that it had lost by then;
         the difference to the frame before was lost between the two."""
         source, flags, data = frame_of(raw, message_flags)
+        time_ns, lost = self.stamped(ancillary)
+        if lost:
+            flags |= _LOST_BEFORE
+        return Frame(time_ns, source, flags, data, lost)
+
+    def stamped(self, ancillary: Sequence[tuple[int, int, bytes]]) -> tuple[int, int]:
+        """The host's time, and how many were lost since the one before."""
         time_ns = lost = 0
         for _, kind, value in ancillary:
             if kind == STAMPS:
@@ -44,9 +51,7 @@ class Reception:
                 self._told = count
             else:
                 time_ns = self._time_ns(kind, value)
-        if lost:
-            flags |= _LOST_BEFORE
-        return Frame(time_ns or self._now_ns(), source, flags, data, lost)
+        return time_ns or self._now_ns(), lost
 
     def missed(self, count: int) -> int:
         """Frames of the kernel's ``count`` that no frame has told."""

@@ -31,9 +31,10 @@ from triaxcal_drivers.nearest import nearest
 
 AT_ONCE = 1024
 """Frames that `receive` gives at most: of a tenth of a second, of a full bus."""
-GATHER_S = 0.005
+GATHER_S, GATHER_MOST_S = 0.005, 0.1
 """What comes within this time of a frame comes with it, for fewer wake-ups; not
-while an answer is awaited."""
+while an answer is awaited. The longer the fewer come."""
+GATHER_FEW, GATHER_MANY = 32, 256  # frames: from the former on another wake-up hardly counts
 ANSWER_S = 0.1  # after something was sent
 SEND_S = 0.1  # in which a queue of ten frames, as interfaces have, gets empty even at 20 kbit/s
 RETRY_S = 0.001
@@ -58,6 +59,7 @@ class SocketCan:
         self._missed = 0  # when it was closed
         self._failure: str | None = None
         self._closed, self._bus_off = False, False
+        self._gather_s = GATHER_S
         self._sent_s, self._heard_s = -math.inf, time.monotonic()
         self._receiving, self._sending = threading.Lock(), threading.Lock()
         self._end = os.eventfd(0, os.EFD_CLOEXEC)
@@ -90,9 +92,15 @@ class SocketCan:
             return frames
 
     def _woken(self) -> list[Frame]:
-        if time.monotonic() - self._sent_s > ANSWER_S:
-            time.sleep(GATHER_S)
-        return self._drain()
+        gathers = time.monotonic() - self._sent_s > ANSWER_S
+        if gathers:
+            time.sleep(self._gather_s)
+        frames = self._drain()
+        if len(frames) > GATHER_MANY:
+            self._gather_s = max(GATHER_S, self._gather_s / 2)
+        elif gathers and len(frames) < GATHER_FEW:
+            self._gather_s = min(GATHER_MOST_S, self._gather_s * 2)
+        return frames
 
     def _drain(self) -> list[Frame]:
         """What waits. The kernel tells of a failure before the frames that came

@@ -384,8 +384,8 @@ def test_the_unit_of_another_reference_is_that_of_every_coefficient(
 
 
 def test_what_is_no_number_is_within_no_limit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert [judge(1e-4, rms) for rms in (0.9e-4, 1e-4, 1.1e-4, math.inf, math.nan)] == [0, 0, 1, 1, 1]
-    assert judge(None, math.nan) == 0
+    assert [judge(1e-4, rms, 1.0) for rms in (0.9e-4, 1e-4, 1.1e-4, math.inf, math.nan)] == [0, 0, 1, 1, 1]
+    assert judge(None, math.nan, 1.0) == 0
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 

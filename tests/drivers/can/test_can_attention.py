@@ -15,7 +15,8 @@ from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import PatientSdo
-from triaxcal_drivers.can.receive import FrameQueue
+from triaxcal_drivers.can.receive import BATCH_S, FrameQueue
+from triaxcal_drivers.errors import BusError
 
 HELD_UP_S = 30.0
 ANSWER = bytes.fromhex("43 18 10 01 41 49 52 54")
@@ -132,3 +133,52 @@ def test_an_answer_that_is_there_when_the_time_runs_out_is_in_time() -> None:
     sdo.RESPONSE_TIMEOUT = 0.0
     sdo.network.send_message = lambda *_: sdo.on_response(0x585, ANSWER, 0.0)
     assert sdo.upload(0x1018, 1) == ANSWER[4:]
+
+
+def test_of_a_stream_that_flows_a_batch_is_what_came_in_its_time() -> None:
+    """From the second on nobody is told of the first frame of each."""
+
+    async def work() -> tuple[list[int], float]:
+        frames, loop = opened(), virtual()
+        for number in range(100):
+            loop.call_later(0.0101 * number, frames.put, [FRAME])
+        begun_s, sizes = loop.time(), []
+        while sum(sizes) < 100:
+            batch = await frames.batch(5.0)
+            assert batch is not None
+            sizes.append(len(batch))
+        return sizes, loop.time() - begun_s
+
+    sizes, took_s = run(work())
+    assert sizes[:-1] == pytest.approx([BATCH_S / 0.0101] * (len(sizes) - 1), abs=2)
+    assert took_s <= 1.01 + BATCH_S
+
+
+def test_frames_that_wait_behind_losses_are_given_without_a_pause() -> None:
+    """However many losses there are, each of which begins a batch."""
+
+    async def work() -> float:
+        frames, begun_s = opened(), virtual().time()
+        frames.put([FRAME._replace(lost=1)] * 100)
+        for _ in range(100):
+            batch = await frames.batch(5.0)
+            assert batch is not None
+            assert len(batch) == 1
+        return virtual().time() - begun_s
+
+    assert run(work()) <= 2 * BATCH_S
+
+
+def test_a_stream_that_flowed_and_stops_is_silent_in_its_time() -> None:
+    async def work() -> float:
+        frames = opened()
+        frames.put([FRAME])
+        assert await frames.batch(2.0) is not None
+        begun_s = virtual().time()
+        assert await frames.batch(2.0) is None
+        frames.fail(BusError("gone"))
+        with pytest.raises(BusError, match="gone"):
+            await frames.batch(2.0)
+        return virtual().time() - begun_s
+
+    assert 2.0 <= run(work()) <= 2.0 + BATCH_S + 2 * TICK_S

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Bools, Floats, Ints, joined
+from triaxcal.arrays import READING_MOST, Bools, Floats, Ints, joined
 from triaxcal.errors import InvalidData
 
 WINDOW_S = 0.1
@@ -31,8 +31,6 @@ long."""
 RATE_LEAST = 12
 """Samples of a stream that ends before that; with fewer the period is not
 known, and there is no window."""
-READING_MOST = 1e100
-"""Squares of readings, and sums of them, have to be numbers too."""
 
 
 def first_period_ns(time_ns: Ints) -> float:
