@@ -19,7 +19,7 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
 from triaxcald.documents import to_text
-from triaxcald.errors import DaemonError, DiskError, Implausible, StationError
+from triaxcald.errors import DaemonError, DiskError, Implausible, StationError, TwoAnswer
 from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
@@ -110,7 +110,7 @@ class WriteBack:
             self._attach(REGISTERS_AFTER, p.after.raw)
             self.writer.event("provisioned", {"written": list(p.written)})
             self.verdict = await self._verify(tumble)
-        except (DiskError, WrongUnit):
+        except (DiskError, WrongUnit, TwoAnswer):  # said as they are
             await p.undo()
             raise
         except (DriverError, DaemonError, TriaxcalError) as e:

@@ -148,9 +148,7 @@ def test_what_is_recorded_later_under_the_same_name_is_used(tmp_path: Path, cloc
         assert (used(series), series.unconfirmed_records()) == (70, 50)
 
 
-def test_a_kill_between_the_file_and_the_manifest_loses_no_mark(
-    tmp_path: Path, clock: Any, batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_the_file_and_the_manifest_loses_no_mark(tmp_path: Path, clock: Any, batch_of: BatchOf) -> None:
     writer = segmented(tmp_path, clock, batch_of, None)
     before = (tmp_path / "rec.segments.json").read_bytes()
     writer.unconfirmed(10, WRONG)
@@ -162,6 +160,8 @@ def test_a_kill_between_the_file_and_the_manifest_loses_no_mark(
     (tmp_path / "rec.segments.json").write_bytes(before)
     clock.now_ns += 60 * S
     segmented(tmp_path, clock, batch_of, None).close()
+    listed = load_manifest(tmp_path / "rec.segments.json").segments
+    assert [s.unconfirmed for s in listed] == [None, 10, 20, 30, None, None, None, None]
     with Series(tmp_path / "rec.segments.json") as series:
         assert (used(series), series.unconfirmed_records()) == (50, 30)
 

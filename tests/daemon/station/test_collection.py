@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,6 +17,7 @@ from triaxcal_drivers.host_clock import SteadyClock
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.errors import TwoAnswer
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -301,3 +302,39 @@ def test_a_batch_without_a_sample_after_a_pause_of_ours_is_no_silence(held_up_s:
         now_s += held_up_s
         watch.look(device)
         pipeline.counts["samples"] += 1
+
+
+@dataclass
+class Mixed:
+    """A node at which two units send side by side, one sample a batch; ``complaints`` are what was told of it."""
+
+    units: int
+    complaints: list[Exception] = field(default_factory=list)
+    samples: int = 0
+
+    def complain(self, trouble: Exception) -> None:
+        self.complaints.append(trouble)
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        for i in range(500):
+            for unit, first in zip(range(self.units), (50_000, 300), strict=False):
+                self.samples += 1
+                at_ns, counter = i * 10**7 + unit * 4 * 10**6, (first + i).to_bytes(2, "little")
+                xy, z = bytes([unit, i % 5]) + bytes(4) + counter, bytes(5) + counter + bytes(1)
+                yield RawBatch.of([(at_ns, 0x185, 0, xy), (at_ns + 1, 0x285, 0, z)])
+
+
+async def test_two_units_at_one_node_are_told_and_not_opened_again_and_again(bundle: Bundle) -> None:
+    device = Mixed(2)
+    with pytest.raises(TwoAnswer, match=r"^two units answer at node 5: "):
+        async for _ in Recorded(CALIBRATION, bundle, "node 5").records(device, None):
+            pass
+    assert device.samples < 300, "within a second or two"
+    assert len(device.complaints) == 1
+
+
+async def test_one_unit_at_a_node_is_not_two(bundle: Bundle) -> None:
+    device = Mixed(1)
+    async for _ in Recorded(CALIBRATION, bundle, "node 5").records(device, None):
+        pass
+    assert (device.samples, device.complaints) == (500, [])
