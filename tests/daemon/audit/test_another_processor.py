@@ -86,11 +86,11 @@ def _line_of_budget(by: float) -> Callable[[Any], None]:
     return change
 
 
-@pytest.mark.parametrize(("by", "result"), [(1e-6, Result.SAME_FIGURES), (1e-3, Result.DIFFERS)])
+@pytest.mark.parametrize(("by", "result"), [(1e-5, Result.SAME_FIGURES), (1e-2, Result.DIFFERS)])
 def test_a_digest_is_compared_by_the_document(
     finished_run: Any, tmp_path: Path, auditor: Any, by: float, result: Result
 ) -> None:
-    """A standard uncertainty is known to a tenth, so that these are 1e-5 and 1e-2 of its own."""
+    """A line of a budget is known to its own size."""
     path = _edited(finished_run.can, tmp_path / "x.mcap", _line_of_budget(by), outcome_too=True)
     found = auditor(path)
     assert found.result is result, found.differences
@@ -106,7 +106,7 @@ def test_a_digest_is_compared_by_the_document(
 
 
 def test_a_digest_of_another_document_is_found(finished_run: Any, tmp_path: Path, auditor: Any) -> None:
-    path = _edited(finished_run.can, tmp_path / "x.mcap", _line_of_budget(1e-6), outcome_too=False)
+    path = _edited(finished_run.can, tmp_path / "x.mcap", _line_of_budget(1e-5), outcome_too=False)
     found = auditor(path)
     assert [(d.part, d.place) for d in found.differences] == [(OUTCOME, f"sha256.{CERTIFICATE}")]
 
@@ -139,7 +139,7 @@ def test_another_processor_is_named_as_such(finished_run: Any, tmp_path: Path, a
     forged.metadata("software").metadata[KERNEL] = "Nehalem"
     for name in (CERTIFICATE, OUTCOME):
         forged.edit(name, lambda document: document["software"].update({KERNEL: "Nehalem"}))
-    forged.edit(CERTIFICATE, _line_of_budget(1e-6))
+    forged.edit(CERTIFICATE, _line_of_budget(1e-5))
     digest = hashlib.sha256(forged.attachment(CERTIFICATE).data).hexdigest()
     forged.edit(OUTCOME, lambda o: o["sha256"].update({CERTIFICATE: digest}))
     report = forged.attachment("report.html").data.decode()
