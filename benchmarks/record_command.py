@@ -117,6 +117,12 @@ def measured(bus: str, rate: int, seconds: float, whole_bus: bool, lean: bool, f
         logger = begin("can_logger", listen)
         recorder = begin("record", [BIN / "triaxcal", "record", station, "-o", ours])
         programs = (recorder, logger)
+        if whole_bus:  # nobody else tells the unit to send
+            options = {"interface": "udp_multicast", "channel": GROUP, "port": port}
+            if bus != "udp_multicast":
+                options = {"interface": "socketcan", "channel": bus}
+            with can.Bus(**options) as starter:
+                starter.send(can.Message(arbitration_id=0, is_extended_id=False, data=[1, NODE]))
         begun_s = time.monotonic()
         time.sleep(min(SETTLED_S, seconds / 2))
         before = [p.spent_s() for p in programs]
