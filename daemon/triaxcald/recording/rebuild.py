@@ -114,7 +114,7 @@ def _with_unconfirmed(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
             continue
         for i, earlier in enumerate(found[: at + 1]):
             if earlier.end > first:
-                starts = [max(first, earlier.first), *([] if earlier.unconfirmed is None else [earlier.unconfirmed])]
+                starts = [max(n, earlier.first) for n in (first, earlier.unconfirmed) if n is not None]
                 found[i] = replace(earlier, unconfirmed=min(starts))
     return tuple(found)
 
