@@ -157,7 +157,7 @@ async def test_nothing_false_is_said_after_two_faults(folder: Path, kind: Kind) 
 
 
 @pytest.mark.slow
-@every_kind
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.counter], ids=str)
 async def test_nothing_false_is_said_after_three_faults_wherever_they_strike(folder: Path, kind: Kind) -> None:
     every = orders(3, (*FAULTS, "flipped"))
     assert await false_statements(kind, every, 2, folder) == []
