@@ -53,11 +53,10 @@ def demo(once: Callable[..., Path]) -> list[Path]:
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS, ids=lambda e: ",".join(e.values()))
 def test_an_untouched_recording_is_never_said_to_differ(demo: list[Path], environment: dict[str, str]) -> None:
-    names = ("can-second-order.mcap", "modbus-temperature-bias.mcap", "by-0.1.0.mcap")
-    paths = [*demo, *(RECORDINGS / name for name in names)]
+    paths = [*demo, RECORDINGS / "can-second-order.mcap"]
     done = subprocess.run(
         [sys.executable, "-m", "triaxcald.cli", "audit", "--json", *map(str, paths)],
-        env={**{k: v for k, v in os.environ.items() if k != "OPENBLAS_CORETYPE"}, **environment},
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         check=False,
