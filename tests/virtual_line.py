@@ -139,9 +139,9 @@ class _VirtualRun(line.UnitRun):
         return self._device.writer
 
 
-def _linked(device: VirtualDevice, *arguments: Any) -> RegisterLink:
+def _linked(device: VirtualDevice, *arguments: Any, **settings: Any) -> RegisterLink:
     """By the host's clock a store would stall while another unit's fit keeps this one from being asked."""
-    return RegisterLink(device, *arguments, pace=device.pace)
+    return RegisterLink(device, *arguments, **settings, pace=device.pace)
 
 
 @contextlib.contextmanager
