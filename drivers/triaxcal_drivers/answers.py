@@ -56,9 +56,14 @@ class Answers(Generic[KeyT]):
     def asked(self, key: KeyT) -> None:
         self._open[key] = min(self._open[key] + 1, OPEN_MOST)
 
-    def answered(self, key: KeyT, answer: bytes) -> None:
+        while len(self._open) > 2 * KEYS_MOST:  # requests that nothing ever answered
+            del self._open[next(iter(self._open))]
+
+    def answered(self, key: KeyT, answer: bytes, *, final: bool = True) -> None:
+        """``final``: no other answer to the same request is to come, as one may
+        after "busy"."""
         if self._open[key] > 0:
-            self._open[key] -= 1
+            self._open[key] -= final
             self._last[key] = answer
             self._last.move_to_end(key)
             while len(self._last) > KEYS_MOST:

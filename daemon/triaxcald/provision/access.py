@@ -64,7 +64,7 @@ class RegisterLink:
         name: str = "",
     ) -> None:
         steps = (*profile.sequences.store, *profile.sequences.reset)
-        self.pace, self.name = pace, name
+        self.pace, self.name, self.profile = pace, name, profile
         self._device = device
         self._record = record or (lambda access: None)
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}

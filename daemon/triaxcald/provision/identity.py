@@ -82,6 +82,8 @@ async def _also(link: RegisterLink, bundle: Bundle, serial: str) -> bool:
     return any(same_serial(serial_text(n), serial) for n in numbers if n is not None)
 
 
+ABORT_BYTES = 8
+"""Of a CANopen answer that refuses."""
 LISTEN_S = 0.2
 """By the host's clock: longer than a node takes that answers slowly, and short
 beside the time that an operator takes to put a unit in place."""
@@ -99,7 +101,8 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
     cannot tell passes.
     """
     profile = bundle.profile
-    name = profile.identity.serial_register or probe(profile)
+    readable = (name for name, register in profile.registers.items() if register.access != "wo")
+    name = probe(profile) or next(readable, None)
     if name is None:
         return
     for _ in range(ASKED):
@@ -111,14 +114,19 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
             raise TwoAnswer(f"two units answer at {link.name}: {_who(bundle, name, answers)}")
         if not link.doubled:
             return
+    link.two_answered = True
     raise TwoAnswer(f"two units answer at {link.name}: each request was answered twice, byte for byte")
 
 
 async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[ExtraAnswer]]:
     """What a register was answered with, and the answers that contradict."""
     answers = [await link.read(name)]
-    found = await link.listen(LISTEN_S)
-    return answers + [e.answer for e in found if e.register == name], found
+    most = max(TYPES[link.profile.registers[name].type].size, ABORT_BYTES)
+    # Another program may ask the unit for something else, and a stream may be
+    # polled meanwhile, whose replies are longer than a register.
+    extra = await link.listen(LISTEN_S)
+    found = [e for e in extra if e.register == name and e.first is not None and len(e.answer) <= most]
+    return answers + [e.answer for e in found], found
 
 
 def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:

@@ -22,6 +22,7 @@ hold it."""
 
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
+_WHOLE = re.compile(r"(-?)([0-9]+)")
 _RUN = "[0-9a-f]" * 8 + "-*"
 """How the identifier of a run begins."""
 
@@ -38,10 +39,11 @@ class Owner:
     @staticmethod
     def of(profile: Profile, slot: str, serial: str | None) -> Owner:
         """``serial`` as a station file or a device states it."""
-        number = serial.strip() if serial else None
-        if number and number.isdigit():
-            number = f"{int(number):04d}"
-        return Owner(profile.identity.product, number, slot)
+        stated = serial.strip() if serial else None
+        if stated and (number := _WHOLE.fullmatch(stated)):  # as `serial_text` has it
+            sign, digits = number.groups()
+            stated = sign + (digits.lstrip("0") or "0").rjust(4 - len(sign), "0")
+        return Owner(profile.identity.product, stated or None, slot)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from triaxcald.provision.image import RegisterImage, image_of
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of
 from triaxcald.provision.plausible import Doubt, doubts, unstable
 from triaxcald.provision.proof import Restart, proven_restart
-from triaxcald.provision.restore import differing, restore
+from triaxcald.provision.restore import restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -385,6 +385,9 @@ class Provisioning:
         except ProvisionError:
             self._decided = False  # a value that nobody wants is in use
             raise
+        except TwoAnswer:  # a mark may be in use
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+            raise
         self.steps.append("identity after the reset")
         await self._decide(Evidence.RESTART if restart.mark_gone else Evidence.READ_BACK)
 
@@ -425,26 +428,54 @@ class Provisioning:
         self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         self.held.observed.clear()
         self.link.refresh()
-        self.link.tolerate()
         self.link.go_on_unrecorded()
         self.link.touched.clear()
-        try:
-            two_answered = self.link.two_answered
-            evidence = await restore(self.link, self.bundle, self.before, stored=lasting, wanted=self.image.raw)
-            self.held.saw(Observation.READ_BACK)
-            if evidence is Evidence.RESTART:
-                self.held.saw(Observation.MARK_GONE)
-            if two_answered and lasting:  # what was read may be the other unit's
-                await require_alone(self.link, self.bundle)
-                if await differing(self.link, self.bundle, self.before):
-                    raise ProvisionError("the old calibration is not back")
-            self.held.now(DeviceState.OLD, evidence)
-        except (StationError, DriverError) as e:
-            self.undoing_failed = str(e)
-            if not self.link.touched & set(self.before.raw):
-                self.held.now(*was)
-            with suppress(DriverError, StationError):
-                await self._judge(lasting)
+        if not self.link.two_answered:
+            try:
+                evidence = await restore(self.link, self.bundle, self.before, stored=lasting, wanted=self.image.raw)
+            except TwoAnswer:
+                pass
+            except StationError as e:
+                self.undoing_failed = str(e)
+                if not self.link.touched & set(self.before.raw):
+                    self.held.now(*was)
+                with suppress(DriverError, StationError):
+                    await self._judge(lasting)
+                return
+            else:
+                self.held.saw(Observation.READ_BACK)
+                if evidence is Evidence.RESTART:
+                    self.held.saw(Observation.MARK_GONE)
+                self.held.now(DeviceState.OLD, evidence)
+                return
+        await to_its_end(self._undo_beside_another(lasting))
+
+    async def _undo_beside_another(self, lasting: bool) -> None:
+        """While two units answer, a write reaches both. So nothing is stored: a
+        restart brings back what each of them has stored, and without one the old
+        registers are put in use again. What a store or a direct write may have
+        changed stays until one unit is taken away."""
+        self.link.tolerate()
+        self.undoing_failed = "two units answer; take one of them away, then restore"
+        with suppress(DriverError, StationError):
+            await lock_quietly(self.link, self.bundle)
+            if self.resets:
+                await self._sequence("reset")
+            elif not lasting:
+                await self._write_old_in_use()
+            if lasting:
+                return
+            self.after = await self._look()
+            if not self.after.differing(self.before.raw):
+                self.undoing_failed = None
+                # Without a restart the other unit may be the one that was read.
+                self.held.now(DeviceState.OLD, Evidence.NOTHING_STORED if self.resets else Evidence.READ_BACK)
+
+    async def _write_old_in_use(self) -> None:
+        await self._sequence("unlock")
+        for name in self.written:
+            await self.link.write(name, self.before.raw[name])
+        await lock_quietly(self.link, self.bundle)
 
     async def _named(self, e: DriverError | StationError) -> DriverError | StationError:
         """Two units that answer, with the serial numbers of both."""
@@ -463,8 +494,6 @@ class Provisioning:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        if self.link.two_answered:
-            await require_alone(self.link, self.bundle)
         restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
         held = self.after = await self._look()
         state = self._state_of(held)
@@ -506,8 +535,12 @@ class Provisioning:
         await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
 
     async def _look(self) -> Snapshot:
+        """All registers, of a unit that alone answered until they were read."""
         await self._require_same_unit()
-        return await take_snapshot(self.link, self.bundle)
+        found = await take_snapshot(self.link, self.bundle)
+        if not self.link.tolerant:
+            await require_alone(self.link, self.bundle)
+        return found
 
     async def _reach(self) -> None:
         self.link.refresh()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, WriteStep
-from triaxcald.errors import ProvisionError, StationError
+from triaxcald.errors import ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
@@ -55,7 +55,8 @@ async def proven_restart(
     locked device may ignore it, or the device may carry it out later. So one
     register in use first gets a mark: a value that is stored nowhere, one bit
     off from the value that it holds. Only a restart takes the mark away. The
-    register gets its value back if the restart fails or does not show.
+    register gets its value back if the restart fails or does not show; while two
+    units answer, a restart is sent in its place.
 
     ``known`` are register images, one of which is stored: no mark equals them.
     No register gets a mark where writes last without a store, or where the
@@ -64,12 +65,21 @@ async def proven_restart(
     SequenceStalled of the restart.
     """
     touched = set(link.touched)
-    mark = await _marked(link, bundle, serial, known)
-    if mark is None:
-        return Restart(await run_sequence(link, bundle, "reset"), mark_gone=False)
+    mark: _Mark | None = None
     try:
+        mark = await _marked(link, bundle, serial, known)
+        if mark is None:
+            return Restart(await run_sequence(link, bundle, "reset"), mark_gone=False)
         restart, mark = await _restarted(link, bundle, serial, mark, known)
+    except TwoAnswer:  # the mark may be in use in both units, and only a restart takes it away from either
+        link.tolerate()
+        with suppress(DriverError, StationError):
+            await lock_quietly(link, bundle)
+            await run_sequence(link, bundle, "reset")
+        raise
     except BaseException as e:
+        if mark is None:
+            raise
         try:
             await _put_back(link, bundle, serial, mark)
         except (DriverError, StationError):
@@ -184,7 +194,7 @@ async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str
         await check_identity(link, bundle, serial)
         await run_sequence(link, bundle, "unlock")
         await check_identity(link, bundle, serial)  # right before the one write that could reach another unit
-    except WrongUnit:
+    except (WrongUnit, TwoAnswer):
         raise
     except (*NO_CONTACT, RegisterRefused, StationError):
         link.refresh()

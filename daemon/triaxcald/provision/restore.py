@@ -8,9 +8,9 @@ from contextlib import suppress
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
-from triaxcald.errors import ProvisionError, StationError
+from triaxcald.errors import ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
-from triaxcald.provision.identity import WrongUnit, check_identity
+from triaxcald.provision.identity import WrongUnit, check_identity, require_alone
 from triaxcald.provision.proof import proven_restart
 from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
@@ -87,7 +87,7 @@ async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known
     await lock_quietly(link, bundle)
     try:
         return (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
-    except WrongUnit:
+    except WrongUnit:  # one of ProvisionError
         raise
     except (RegisterRefused, ProvisionError):
         return False  # writing back may still do
@@ -101,9 +101,10 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, kn
             await link.write(name, snapshot.raw[name])
         await _require_equal(link, bundle, snapshot)  # before anything wrong is made permanent
         if stored:
+            await require_alone(link, bundle)  # a store reaches whoever hears it
             acknowledged = await run_sequence(link, bundle, "store")
             await _require_equal(link, bundle, snapshot)  # the supply may have failed in the store
-    except WrongUnit:
+    except (WrongUnit, TwoAnswer):
         theirs = True
         raise
     finally:

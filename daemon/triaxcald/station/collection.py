@@ -114,9 +114,11 @@ class Recorded(RawRecords):
                     if self._is_due(batch, seconds):
                         self._decode()
                     yield batch
-            finally:
-                with suppress(RecordingError):  # why it ends, then
+            except BaseException:  # which says more than what the rest would
+                with suppress(RecordingError, TwoAnswer):
                     self._decode()
+                raise
+            self._decode()
 
     def _is_due(self, batch: RawBatch, seconds: float | None) -> bool:
         """Whether what has come is to be decoded by now."""

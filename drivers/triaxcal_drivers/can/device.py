@@ -41,7 +41,7 @@ _HEARTBEAT, _BOOTED = 0x700, b"\0"
 """Of CiA 301: a node that has booted says so by a heartbeat of state 0."""
 _BOOT_LOOK_S = 0.1
 """How often a stream that brings nothing looks whether the node has booted."""
-_ABORTED = 0x80
+_ABORTED, _ABORT = 0x80, b"\x80"
 _DOWNLOAD, _UPLOAD = 1, 2
 _BEGINS = (2, 3)
 """The server's command specifiers of answers that begin an upload or a download."""
@@ -59,9 +59,9 @@ class PatientSdo(SdoClient):
     of the node, is skipped.
     """
 
-    def __init__(self, node_id: int, attention: Attention) -> None:
-        self.answers: Answers[bytes] = Answers()
-        """By object: index and sub-index as on the wire."""
+    def __init__(self, node_id: int, attention: Attention, answers: Answers[bytes]) -> None:
+        self.answers = answers
+        self._in_segments = False
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         super().__init__(0x600 + node_id, 0x580 + node_id, nothing_known)  # type: ignore[no-untyped-call]
         self._attention = attention
@@ -69,7 +69,8 @@ class PatientSdo(SdoClient):
 
     def send_request(self, request: bytes) -> None:
         self._asked = request[0] >> 5
-        if self._asked in (_DOWNLOAD, _UPLOAD):
+        self._in_segments = self._asked not in (_DOWNLOAD, _UPLOAD)
+        if not self._in_segments:
             self._object = bytes(request[1:4])
             self.answers.asked(self._object)
         super().send_request(request)  # type: ignore[no-untyped-call]
@@ -77,7 +78,11 @@ class PatientSdo(SdoClient):
     def receive(self, response: bytes) -> None:
         """From the receive thread: each answer of the node, whoever asked."""
         # Segments name no object: only the answer that begins a transfer counts.
-        if response and (response[0] == _ABORTED or response[0] >> 5 in _BEGINS):
+        # An abort of the segments belongs to the same transfer.
+        ends_segments = self._in_segments and response[:1] == _ABORT and self._named_by(response) == self._object
+        if ends_segments:
+            self._in_segments = False
+        elif response and (response[0] == _ABORTED or response[0] >> 5 in _BEGINS):
             self.answers.answered(self._named_by(response), response)
         self.responses.put(response)
 
@@ -146,6 +151,9 @@ class CanDevice:
         self._layouts = layouts
         self._connection: _Connection | None = None
         self._dropped = 0
+        # By object, as on the wire. They outlive a connection: an answer to a
+        # request of the one before may come late.
+        self._answers: Answers[bytes] = Answers()
         self._booted: asyncio.Event | None = None  # while a stream is open
         self._sdo_lock = threading.Lock()  # one transfer at a time, also after a caller was cancelled
 
@@ -159,7 +167,7 @@ class CanDevice:
         """Raises BusError, DeviceAbsent."""
         await self.close()
         line = await join(self._settings)
-        sdo = PatientSdo(self._settings.node_id, line.attention)
+        sdo = PatientSdo(self._settings.node_id, line.attention, self._answers)
         sdo.network = cast(canopen.Network, _Sender(line))
         self._connection = _Connection(line, FrameQueue(line.attention), sdo)
         started = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 
@@ -44,9 +45,10 @@ _DOUBLINGS = 10
 """Of the pause before a unit that does not answer is asked again: a thousand
 time-outs at most."""
 
-_CONTRADICTIONS = 3
-"""So many replies to a poll that no request explains, each with other bytes
-than the one before it, come from another unit. One may be a very late reply."""
+_CONTRADICTIONS, _POLLS = 3, 20
+"""So many of the last polls with a reply that no request explains, and that has
+other bytes than the one before it: another unit sends them. A single one may
+be a very late reply, or one that a gateway asked for again."""
 
 _EMPTY = "it answers, but its FIFO stays empty"
 
@@ -163,15 +165,15 @@ class ModbusDevice:
         for name in names:
             await self._discard(self._polled(name))
         polled = [self._polled(name) for name in names]
-        contradictions = 0
+        contradictions = deque[bool](maxlen=_POLLS)
         while polled:
             await asyncio.sleep(min(p.due_s for p in polled) - loop.time())
             for p in [p for p in polled if p.due_s <= loop.time()]:
                 p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
                 records = await self._drain(p)
                 yield RawBatch.of(records)
-                contradictions += sum(not e.same for e in await self.listen(0.0))
-                if contradictions >= _CONTRADICTIONS:
+                contradictions.append(any(not e.same for e in await self.listen(0.0)))
+                if sum(contradictions) >= _CONTRADICTIONS:
                     raise SecondAnswer(f"two units answer at {self._connected().where}")
                 self._check_heard(p, polled)
                 if p.again:

@@ -22,6 +22,9 @@ from triaxcal_drivers.errors import BusError, DeviceSilent
 from triaxcal_drivers.modbus.protocol import Misanswered, SerialLine, Spoiled, TcpAddress, read_reply_bytes
 from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, reason_of
 
+_FOR_NOW = (b"\x05", b"\x06", b"\x0a", b"\x0b")
+"""Exceptions after which the unit's own reply may still come: it is busy, or a
+gateway did not wait for it."""
 _LOOK_S = 0.01
 """How often a unit that owes a late reply looks whether it has come, and
 whether a line has fallen silent."""
@@ -218,7 +221,7 @@ class Line:
         # A reply in another transaction than any that was sent is no answer.
         key = self._key(unit, transaction)
         if self._answers.was_asked(key):
-            self._answers.answered(key, pdu)
+            self._answers.answered(key, pdu, final=not (pdu[0] & 0x80 and pdu[1:2] in _FOR_NOW))
         if transaction != self._transaction:
             self._other = f"a reply came as transaction {transaction}, expected {self._transaction}"
             return

@@ -42,6 +42,8 @@ class Run:
     stored: Mapping[str, bytes]
     in_use: Mapping[str, bytes]
     others: Mapping[str, bytes] | None
+    stores: bool
+    """Whether writes take a store to last. A direct write reaches a second unit before anybody can know of it."""
 
 
 def provisioning(device: ModelDevice, folder: Path, wanted: Mapping[str, bytes]) -> Provisioning:
@@ -64,7 +66,8 @@ async def _to_the_end(device: ModelDevice, folder: Path) -> Run:
 def _run(p: Provisioning, device: ModelDevice, done: bool) -> Run:
     unit, second = device.unit, device.second
     others = None if second is None else dict(second.eeprom)
-    return Run(done, p.held.state, p.held.evidence, p.settled, dict(unit.eeprom), dict(unit.ram), others)
+    stores = device.kind.store
+    return Run(done, p.held.state, p.held.evidence, p.settled, dict(unit.eeprom), dict(unit.ram), others, stores)
 
 
 async def _restored(device: ModelDevice, folder: Path) -> Run | None:
@@ -103,7 +106,7 @@ def wrong(run: Run) -> str | None:
             return "said to hold a mixture"
     if is_mixture(run.in_use) and run.state not in (DeviceState.MIXED, DeviceState.UNKNOWN):
         return "a mixture is not told"
-    if run.done and run.others not in (None, OTHERS):
+    if run.others not in (None, OTHERS) and (run.done or run.stores):
         return "a second unit was stored as well"
     if run.done and run.state in (DeviceState.MIXED, DeviceState.UNKNOWN):
         return "ended well with nothing known"

@@ -131,11 +131,15 @@ async def test_whenever_a_second_unit_appears_the_state_is_as_told(tmp_path: Pat
                 assert starts_with == "old", at
             case DeviceState.NEW_VERIFIED:
                 assert starts_with == "new", at
-        # Until the last look before the store, the second unit keeps its calibration, and the first its old one.
-        if at < store - 3 and habits.store_command:
-            assert not done
+            case DeviceState.NEW_UNVERIFIED:
+                assert {n: raw for n, raw in host.unit.in_use.items() if n in host.new} == host.new, at
+        # A second unit keeps its calibration; until the last look before the store the first keeps its old one.
+        if habits.store_command:
             assert other.eeprom == FACTORY.image(habits), at
+        if at < store - 3 and habits.store_command:
             assert starts_with == "old", at
+        if at < len(asked) - 3:  # from the last look on, nobody asks any more
+            assert not done, at
 
 
 def test_answers_are_counted_against_requests() -> None:

@@ -12,6 +12,7 @@ import pytest
 from canopen.sdo.exceptions import SdoCommunicationError
 
 from tests.drivers.virtual_time import run, virtual
+from triaxcal_drivers.answers import Answers
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import PatientSdo
@@ -81,7 +82,7 @@ class Clock:
 
 
 def client(clock: Clock) -> tuple[PatientSdo, list[bytes]]:
-    sdo, sent = PatientSdo(5, cast(Any, clock)), []
+    sdo, sent = PatientSdo(5, cast(Any, clock), Answers()), []
 
     class Network(canopen.Network):
         def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
