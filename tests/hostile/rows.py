@@ -204,8 +204,8 @@ PATHS = [
 ]
 DESCRIPTIONS = [
     Row("a start bit of 2^32", dbc(DBC_HEAD + SIGNAL.format(name="Ux", place="4294967296|8@1+")), 2, "does not fit"),
-    Row("a length of 2^32", dbc(DBC_HEAD + SIGNAL.format(name="Ux", place="0|4294967296@1+")), 2, "does not fit"),
-    Row("a message of 2^32 bytes", dbc(DBC_HEAD.replace(": 8", ": 4294967295")), 2, "no signal 'Ux'"),
+    Row("a length of 2^32", dbc(DBC_HEAD + SIGNAL.format(name="Ux", place="0|4294967296@1+")), 2, "expected 1 to 64"),
+    Row("a message of 2^32 bytes", dbc(DBC_HEAD.replace(": 8", ": 4294967295")), 2, "expected at most 64"),
     Row("160,000 signals", profile("[", "[", dbc=_vehicle), 2, "more than 100000 messages and signals"),
     Row("2^32 multiplexer values", dbc(DBC_HEAD + "\nSG_MUL_VAL_ 389 S M 0-4294967295;\n"), 2, "no signal 'Ux'"),
     Row("16 million quotes", dbc('"' * (2**24 - 1)), 2, "more than 1000000 statements"),

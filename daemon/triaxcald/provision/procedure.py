@@ -357,12 +357,16 @@ class Provisioning:
 
     async def _prove(self) -> None:
         self._decided = True  # whatever happens now, writing more would not make it any surer
-        if self.resets:
-            await self._prove_by_restart()
-        else:
-            await self._decide(Evidence.READ_BACK)  # it may have dropped the registers when it was locked
-        if self.held.state is not DeviceState.NEW_VERIFIED:
-            await self._prove_by_power_cycle()
+        try:
+            if self.resets:
+                await self._prove_by_restart()
+            else:
+                await self._decide(Evidence.READ_BACK)  # it may have dropped the registers when it was locked
+            if self.held.state is not DeviceState.NEW_VERIFIED:
+                await self._prove_by_power_cycle()
+        except TwoAnswer:  # a mark may be in use, and a restart may have changed what is
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+            raise
         if self.held.state is DeviceState.UNKNOWN:
             raise ProvisionError("the store went unanswered, and no read decides what it did")
 
@@ -384,9 +388,6 @@ class Provisioning:
             return
         except ProvisionError:
             self._decided = False  # a value that nobody wants is in use
-            raise
-        except TwoAnswer:  # a mark may be in use
-            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
             raise
         self.steps.append("identity after the reset")
         await self._decide(Evidence.RESTART if restart.mark_gone else Evidence.READ_BACK)

@@ -97,7 +97,7 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Line]
         pace = Pace(made.clock.sleep, made.clock.now)
         monkeypatch.setattr(Place, "device", lambda _: made.device())
         for module in (session, write_back):
-            monkeypatch.setattr(module, "RegisterLink", lambda *given: RegisterLink(*given, pace=pace))
+            monkeypatch.setattr(module, "RegisterLink", lambda *given, **more: RegisterLink(*given, **more, pace=pace))
         for name, value in (("LOOK_SAMPLES_S", 2.0), ("LOOK_HOST_S", 0.0), ("LOOK_SHARE", 0.0)):
             monkeypatch.setattr(collection, name, value)
         return made

@@ -17,6 +17,16 @@ from triaxcald.recording.reader import Recording
 Run = Callable[..., Any]
 
 
+@pytest.fixture(autouse=True)
+def _streams_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the second unit answered no request: then nothing but the streams tells that there are two."""
+
+    async def one_answer(*_: Any) -> None: ...
+
+    monkeypatch.setattr("triaxcald.provision.identity.require_alone", one_answer)
+    monkeypatch.setattr("triaxcald.run.session.require_alone", one_answer)
+
+
 def two_at_one_node(workshop: Any, stack: ExitStack, channel: str, *, speed: float = 1.0) -> list[Any]:
     """Of one serial number, so that their streams alone tell them apart; the second one began later."""
     bus = {"interface": "virtual", "channel": channel, "node_id": 5}
