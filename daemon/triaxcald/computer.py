@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import numpy.linalg  # noqa: F401 - brings the other library
 import scipy.linalg  # noqa: F401 - brings a library of linear algebra of its own
 from threadpoolctl import ThreadpoolController
 
@@ -30,7 +30,6 @@ def compute_with_one_thread() -> None:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    np.linalg.inv(np.eye(2))
     return ThreadpoolController()
 
 
