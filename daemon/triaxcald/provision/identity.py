@@ -60,11 +60,13 @@ async def check_identity(
     return IdentityRead(serial, values)
 
 
-async def identified(link: RegisterLink, bundle: Bundle, expected_serial: str | None, *, where: str) -> IdentityRead:
-    """As `check_identity`, and no other unit answers at the same address.
-    Raises TwoAnswer too."""
+async def identified(
+    link: RegisterLink, bundle: Bundle, expected_serial: str | None, *, where: str, device: Device | None = None
+) -> IdentityRead:
+    """As `check_identity` of the ``device``, by default by the link, and no
+    other unit answers at the same address. Raises TwoAnswer too."""
     try:
-        identity = await check_identity(link, bundle, expected_serial, where=where)
+        identity = await check_identity(device or link, bundle, expected_serial, where=where)
     except WrongUnit:
         with suppress(DriverError):  # the answer may be that of a second unit
             await require_alone(link, bundle)

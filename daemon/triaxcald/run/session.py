@@ -5,18 +5,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcald import text
 from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
+from triaxcald.provision.identity import IdentityRead, identified
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
@@ -122,13 +120,8 @@ class UnitSession:
         """Raises WrongUnit, TwoAnswer."""
         expected, bundle = identity.serial or self.place.unit.serial, self.place.bundle
         link = RegisterLink(device, self.profile, name=self.place.device_name)
-        try:
-            await check_identity(device, bundle, expected, where=self.place.address)
-        except WrongUnit:
-            with suppress(DriverError):  # the answer may be that of a second unit
-                await require_alone(link, bundle)
-            raise
-        await require_alone(link, bundle)
+        # Once, without the patience of the link: who waits for a unit asks again.
+        await identified(link, bundle, expected, where=self.place.address, device=device)
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")

@@ -24,7 +24,6 @@ def _streams_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     async def one_answer(*_: Any) -> None: ...
 
     monkeypatch.setattr("triaxcald.provision.identity.require_alone", one_answer)
-    monkeypatch.setattr("triaxcald.run.session.require_alone", one_answer)
 
 
 def two_at_one_node(workshop: Any, stack: ExitStack, channel: str, *, speed: float = 1.0) -> list[Any]:
