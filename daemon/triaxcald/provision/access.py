@@ -73,7 +73,7 @@ class RegisterLink:
         self._watched = False
         self._second: TwoAnswer | None = None
         self.two_answered = self.tolerant = False
-        """Whether an answer too many came, and whether it stops nothing."""
+        """Whether two units have answered, and whether that stops nothing."""
         self.doubled = 0
         """Answers that came twice, byte for byte, since the last `listen`."""
         self.touched: set[str] = set()
@@ -126,9 +126,7 @@ class RegisterLink:
         listen = getattr(self._device, "listen", None)
         extra: list[ExtraAnswer] = [] if listen is None else await listen(seconds)
         self.doubled += sum(e.same for e in extra)
-        contradicting = [e for e in extra if not e.same]
-        self.two_answered |= bool(contradicting)
-        return contradicting
+        return [e for e in extra if not e.same]
 
     async def read(self, register: str) -> bytes:
         return await self._patiently("read", lambda: self._read(register))
@@ -180,6 +178,7 @@ class RegisterLink:
             e = found[0]
             of = f"register {e.register}" if e.register else "a request of another program"
             first = "" if e.first is None else f"{e.first.hex()}, then "
+            self.two_answered = True
             self._second = TwoAnswer(f"two units answer at {self.name}: {of}: {first}{e.answer.hex()}")
         if self._second is not None:
             raise self._second

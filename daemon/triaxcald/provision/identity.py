@@ -111,6 +111,7 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
         link.doubled = 0
         answers, found = await _answers(link, name)
         if found:
+            link.two_answered = True
             with suppress(DriverError, TwoAnswer):  # late answers to earlier requests have come by now
                 answers, _ = await _answers(link, name)
             raise TwoAnswer(f"two units answer at {link.name}: {_who(bundle, name, answers)}")
