@@ -91,9 +91,8 @@ class UnitSession:
         what is the matter, and None when it is over."""
 
         async def identify() -> None:
-            await self._require_same(device, identity)
-            if confirmation is not None:
-                confirmation.confirm()
+            same = partial(self._require_same, device, identity)
+            await (same() if confirmation is None else confirmation.returned(same))
 
         def tell(trouble: str | None) -> None:
             lost(trouble)

@@ -48,8 +48,8 @@ again."""
 
 
 class Exchanged(WrongUnit):
-    """Another unit answers, and nothing was lost before: what the stream brought
-    last may be that one's already."""
+    """Another unit answers, and records have come since the right one was last
+    identified. They may be the other unit's, so the unit is not waited for."""
 
 
 class Streaming(Protocol):
@@ -240,8 +240,9 @@ async def claimed(claim: Claim, patience: Patience | None, tell: Callable[[Excep
 class Returning:
     """A device whose streams go on after an interruption.
 
-    ``identify`` is asked after each return, and raises WrongUnit where another
-    unit answers; ``tell`` is told what is the matter, and None when it is over.
+    ``identify`` is asked after each return. It raises WrongUnit where another
+    unit answers and the right one may be waited for, Exchanged where it may not.
+    ``tell`` is told what is the matter, and None when it is over.
     More than ``hole_s`` without a record is a gap.
     """
 
@@ -258,8 +259,6 @@ class Returning:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns, self._hole_s = now_ns, hole_s
         self._complaint: Exception | None = None
-        self._unbroken = False
-        """Whether the next opening follows on records, which showed a restart."""
 
     def complain(self, trouble: Exception) -> None:
         """Of what the stream gave last: the device sends, but not what it is to
@@ -317,7 +316,6 @@ class Returning:
                         until_s = clock.time() + await waiting.beside(trouble)
                         continue
                 asked, until_s = list(names), math.inf
-                self._unbroken = trouble is self._complaint and isinstance(trouble, DeviceRestarted)
                 await waiting.until(self._again, LOST, trouble)
                 self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
 
@@ -351,15 +349,9 @@ class Returning:
         return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))
 
     async def _again(self) -> None:
-        unbroken, self._unbroken = self._unbroken, False
         await self._device.close()
         await self._device.open()
-        try:
-            await self._identify()
-        except WrongUnit as e:
-            if unbroken:
-                raise Exchanged(str(e)) from e
-            raise
+        await self._identify()
 
 
 def _good(batch: RawBatch) -> NDArray[np.intp]:

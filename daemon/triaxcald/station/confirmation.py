@@ -73,8 +73,20 @@ class Confirmation:
         """How many raw records have been marked as unconfirmed."""
         return self._writer.offered - self._confirmed[0] if self._marked and self._writer is not None else 0
 
-    def confirm(self) -> None:
-        """Somebody else has just read that it is the right unit."""
+    async def returned(self, identify: Callable[[], Awaitable[None]]) -> None:
+        """Identifies a unit that was lost and is opened again. Raises Exchanged
+        where another unit answers twice and records have come since the right
+        one was confirmed, else what ``identify`` raises."""
+        try:
+            await identify()
+        except WrongUnit:
+            if self._confirmed[0] == self._here()[0]:
+                raise
+            await asyncio.sleep(SURE_S)
+            try:
+                await identify()
+            except WrongUnit as e:
+                raise Exchanged(str(e)) from e
         if self.wrong is None:
             self._confirmed = self._here()
 
@@ -122,16 +134,13 @@ class Confirmation:
         WrongUnit."""
         try:
             yield
-        except Exchanged as e:
+        except WrongUnit as e:
             self.wrong = e
         except asyncio.CancelledError:
             with suppress(TimeoutError):
                 async with asyncio.timeout(LAST_S):
                     await self._ask_at_the_end()
             if self.wrong is None:
-                raise
-        except WrongUnit:
-            if self.wrong is None:  # it came after a gap: what was before that is the unit's
                 raise
         else:
             await self._ask_at_the_end()

@@ -18,6 +18,7 @@ from tests.daemon.run.test_unit_recording import Told, recorded
 from tests.devices.bench import Bench, Transport
 from tests.devices.memory import Electronics, Silent
 from tests.devices.motion import Motion, Triple
+from tests.devices.place import Trouble
 from tests.devices.profiles import Timing
 from triaxcald.audit import audit
 from triaxcald.recording.manifest import load_manifest
@@ -36,10 +37,11 @@ PATIENT = Timing(reply_s=0.5, silence_s=5.0)
 @dataclass
 class Exchange:
     """Another unit takes the place after so many samples, and shows another voltage; ``back_after`` so many more the
-    first one is there again."""
+    first one is there again. ``dead_after`` so many more nothing answers for a second."""
 
     after: int
     back_after: int | None = None
+    dead_after: int | None = None
     samples: int = 0
     bench: Any = None
     other: Electronics = field(default_factory=lambda: Electronics(serial_number=OTHER_SERIAL))
@@ -50,29 +52,33 @@ class Exchange:
             self.bench.place.swap(self.other)
         elif self.back_after is not None and self.samples == self.after + self.back_after:
             self.bench.place.swap(self.bench.unit)
+        elif self.dead_after is not None and self.samples == self.after + self.dead_after:
+            self.bench.place.trouble = Trouble(dead_after=self.bench.place.requests + 1, dead_for_s=1.0)
         return (0.0, 0.0, THEIRS_V if self.bench.place.unit is self.other else OURS_V)
 
 
 class Mute(Electronics):
-    """Tells nobody who it is once it streams."""
+    """Tells nobody who it is once it has streamed for a second: a node streams before it is identified."""
 
     def __init__(self, exchange: Exchange) -> None:
         super().__init__()
         self._exchange = exchange
 
     def read(self, register: str, now: float) -> bytes:
-        if self._exchange.samples and register in ("serial_number", "product_code"):
+        if self._exchange.samples >= 50 and register in ("serial_number", "product_code"):
             raise Silent
         return super().read(register, now)
 
 
 def bench_of(
-    tmp_path: Path, triaxcal: Callable[..., Any], transport: Transport, exchange: Exchange, **settings: Any
+    tmp_path: Path,
+    triaxcal: Callable[..., Any],
+    transport: Transport,
+    exchange: Exchange,
+    timing: Timing = PATIENT,
 ) -> Bench[Any]:
     node = {"announces": False} if transport == "canopen" else {}
-    bench = Bench(
-        tmp_path, triaxcal, transport, motion=Motion(exchange.readings), node=node, timing=PATIENT, **settings
-    )
+    bench = Bench(tmp_path, triaxcal, transport, motion=Motion(exchange.readings), node=node, timing=timing)
     exchange.bench = bench
     return bench
 
@@ -142,6 +148,22 @@ def test_another_unit_is_noticed_when_the_seconds_are_done(
 
 
 @pytest.mark.slow
+def test_another_unit_that_is_lost_before_anybody_asks_is_noticed_when_it_is_back(
+    tmp_path: Path, triaxcal: Callable[..., Any]
+) -> None:
+    exchange = Exchange(after=60, dead_after=60)
+    out = tmp_path / "rec.mcap"
+    with bench_of(tmp_path, triaxcal, "tcp", exchange, timing=Timing(reply_s=0.2, silence_s=0.4)) as bench:
+        done = triaxcal("record", bench.station, "-o", out, "--seconds", "60")
+    assert done.code == 4
+    assert "0888" in done.err
+    info = info_of(triaxcal, out)
+    assert "interrupted" in [e["kind"] for e in info["events"]], "it was lost"
+    raw = info["raw"]["calibration"]
+    assert raw["unconfirmed"] == raw["records"] > 100, "it was confirmed when it was opened, and not since"
+
+
+@pytest.mark.slow
 def test_segments_that_were_closed_since_are_unconfirmed_too(
     tmp_path: Path, triaxcal: Callable[..., Any], transport: Transport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,7 +198,7 @@ def test_a_unit_that_does_not_say_who_it_is_while_it_streams_is_recorded(
     out = tmp_path / "rec.mcap"
     with bench_of(tmp_path, triaxcal, transport, exchange) as bench:
         bench.place.swap(Mute(exchange))
-        done = triaxcal("record", bench.station, "-o", out, "--seconds", "2")
+        done = triaxcal("record", bench.station, "-o", out, "--seconds", "3")
     assert (done.code, done.err.count("still the same unit")) == (0, 1)
     info = info_of(triaxcal, out)
     assert "unconfirmed" not in info["raw"]["calibration"]

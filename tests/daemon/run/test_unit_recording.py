@@ -185,6 +185,7 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
     work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=3.0))
     await told.until("unit0", lambda text: text == "recording")
+    await asyncio.sleep(0.5)
     await bench.take(0)
     await bench.put(0, serial=13)
     (kept,) = await work
@@ -192,8 +193,11 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     assert kept.exit_code == 4
     assert kept.error is not None
     assert "is serial 0013, expected 4711" in kept.error
+    assert (kept.unconfirmed > 0, kept.counts["samples"]) == (True, 0), "it may have been there before the loss"
     with Recording.open(workshop.folder / "unit0.mcap") as recording:
-        *_, failed, ended = recording.events()
+        *_, marked, failed, ended = recording.events()
+        assert all(batch.unconfirmed for _, batch in recording.joined_batches())
+    assert marked.kind == "unconfirmed"
     assert (failed.kind, "is serial 0013" in failed.text) == ("failed", True)
     assert (ended.kind, ended.detail) == ("ended", {"reason": "unit gave up"})
 

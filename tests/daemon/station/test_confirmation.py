@@ -15,7 +15,7 @@ from triaxcal_drivers.errors import BusError, DeviceBusy, DeviceRestarted, Devic
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import StationError
 from triaxcald.provision.identity import WrongUnit
-from triaxcald.station.coming_back import Exchanged, Patience, Returning
+from triaxcald.station.coming_back import Patience, Returning
 from triaxcald.station.confirmation import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
 
 OTHER = WrongUnit("the unit on node 5 is serial 0888, expected 0777")
@@ -192,11 +192,17 @@ def test_what_else_the_asking_fails_with_ends_the_recording() -> None:
     assert (unit.offered, unit.marked) == (46, [])
 
 
-class Restarting:
-    """Two records; the second shows a restart, and then ``answers`` says who is there, one opening after the other."""
+@dataclass
+class Returned:
+    """Two records, then a loss. After it ``answers`` says who is there, one reading after the other, and two more
+    records come. ``confirmed`` of the first two came before the unit was last confirmed."""
 
-    def __init__(self, *answers: Answer) -> None:
-        self.answers, self.told = list(answers), list[str | None]()
+    answers: list[Answer]
+    confirmed: int = 0
+    offered: int = 0
+    streams: int = 0
+    marked: list[int] = field(default_factory=list)
+    told: list[str | None] = field(default_factory=list)
 
     async def open(self) -> None: ...
 
@@ -207,44 +213,60 @@ class Restarting:
             raise answer
 
     async def stream(self, _: Sequence[str]) -> AsyncIterator[RawBatch]:
+        self.streams += 1
         for i in (1, 2):
             yield RawBatch.of([(i, 1, 0, b"")])
+        if self.streams == 1:
+            raise self.trouble
+
+    def complain(self, trouble: Exception) -> None: ...
+
+    # As the writer, and as what is recorded.
+
+    def unconfirmed(self, first: int, _: Any) -> None:
+        self.marked.append(first)
+
+    def mark(self) -> int:
+        return self.offered
+
+    def back_to(self, mark: int) -> None: ...
 
     async def record(self, trouble: Exception) -> int:
-        returning = Returning(cast(Any, self), self.identify, Patience(most_s=60.0), self.told.append)
-        seen = 0
-        async with aclosing(returning.stream(["readings"])) as stream:
+        self.trouble = trouble
+        confirmation = Confirmation(None, cast(Any, self), self)
+        returning = Returning(
+            cast(Any, self), lambda: confirmation.returned(self.identify), Patience(most_s=60.0), self.told.append
+        )
+        async with confirmation.phase(), aclosing(returning.stream(["readings"])) as stream:
             async for batch in stream:
-                seen += len(batch)
-                if seen == 2:
-                    returning.complain(trouble)
-        return seen
+                self.offered += len(batch)
+                if len(batch) and self.offered == self.confirmed:
+                    await confirmation.returned(self.identify)
+        return self.offered
 
 
-def test_another_unit_right_after_a_restart_that_the_records_show_is_an_exchange() -> None:
-    with pytest.raises(Exchanged, match="0888"):
-        run(Restarting(OTHER, None).record(DeviceRestarted("it has started anew")))
+LOSSES = (DeviceRestarted("it has started anew"), DeviceSilent("gone"), BusError("the link is down"))
 
 
-@pytest.mark.parametrize(
-    ("trouble", "answers"),
-    [
-        (DeviceRestarted("it has started anew"), (DeviceSilent("gone"), OTHER, None)),
-        (DeviceSilent("no whole sample"), (OTHER, None)),
-    ],
-)
-def test_another_unit_after_a_gap_is_waited_out(trouble: Exception, answers: tuple[Answer, ...]) -> None:
-    assert run(Restarting(*answers).record(trouble)) == 4
+@pytest.mark.parametrize("trouble", LOSSES, ids=lambda t: type(t).__name__)
+@pytest.mark.parametrize("before", [(), (DeviceSilent("gone"), BusError("not yet"))], ids=["at once", "later"])
+def test_another_unit_after_a_loss_marks_what_came_since_the_right_one_was_confirmed(
+    trouble: Exception, before: tuple[Answer, ...]
+) -> None:
+    """It may have taken the place before the loss."""
+    unit = Returned([*before, OTHER, OTHER, None])
+    with pytest.raises(WrongUnit, match="0888"):
+        run(unit.record(trouble))
+    assert unit.marked == [0]
 
 
-def test_a_unit_that_was_lost_and_is_replaced_leaves_what_it_sent_before_as_it_is() -> None:
-    async def given_up(unit: Unit) -> None:
-        confirmation = unit.confirmation()
-        async with confirmation.phase():
-            raise OTHER
+def test_a_single_wrong_reading_after_a_loss_ends_nothing() -> None:
+    unit = Returned([OTHER, None])
+    assert run(unit.record(DeviceSilent("gone"))) == 4
+    assert unit.marked == []
 
-    unit = Unit({0.0: None})
-    unit.offered = 7
-    with pytest.raises(WrongUnit):
-        run(given_up(unit))
+
+def test_the_right_unit_is_waited_for_where_nothing_came_since_it_was_confirmed() -> None:
+    unit = Returned([None, OTHER, OTHER, OTHER, None], confirmed=2)
+    assert run(unit.record(DeviceSilent("gone"))) == 4
     assert unit.marked == []
