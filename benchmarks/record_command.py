@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,9 +152,9 @@ def _write_station(path: Path, settings: str, whole_bus: bool) -> None:
     path.write_text(head + (bus if whole_bus else unit))
 
 
-def _until(condition: object, what: str) -> None:
+def _until(condition: Callable[[], object], what: str) -> None:
     until_s = time.monotonic() + 60.0
-    while not condition():  # type: ignore[operator]
+    while not condition():
         if time.monotonic() > until_s:
             raise SystemExit(f"record_command: not within a minute: {what}")
         time.sleep(0.02)
@@ -173,8 +173,8 @@ def row(bus: str, rate: int, seconds: float, runs: int, whole_bus: bool, lean: b
         with tempfile.TemporaryDirectory() as name:
             found.append(measured(bus, rate, seconds, whole_bus, lean, Path(name)))
 
-    def median(of: object) -> float:
-        return statistics.median(of(one) for one in found)  # type: ignore[operator]
+    def median(of: Callable[[tuple[Cost, Cost]], float]) -> float:
+        return statistics.median(of(one) for one in found)
 
     between_s = seconds - min(SETTLED_S, seconds / 2)
     return [
