@@ -21,6 +21,7 @@ def inner_tests() -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1500)  # the first ones wait for the guest, which has a time limit of its own
 @pytest.mark.parametrize("name", inner_tests())
 def test_on_a_can_kernel(name: str, ended: dict[str, Inner]) -> None:
     inner = ended.get(name)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.profile import Bundle, Profile
 from triaxcal_drivers.register_types import TYPES
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink
@@ -19,6 +19,11 @@ from triaxcald.provision.sequence import probe
 
 class WrongUnit(ProvisionError):
     """Another product or another serial number answers than was expected."""
+
+
+class BlankIdentity(WrongUnit):
+    """A register of the identity holds zeros, ones, or no number, as one may of
+    a unit that is starting."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +52,19 @@ async def check_identity(
     for name, expected in profile.identity.expect.items():
         values[name] = await _read_raw_number(device, bundle, name)
         if values[name] != expected:
-            raise WrongUnit(
+            raise _wrong(profile, name, values[name])(
                 f"the unit on {where} is no {profile.identity.product}: "
                 f"register {name} holds {values[name]:#x}, expected {expected:#x}"
             )
-    serial = await read_serial(device, bundle)
+    register = profile.identity.serial_register
+    number = await _read_raw_number(device, bundle, register) if register else None
+    serial = None if number is None else serial_text(number)
     if expected_serial is not None and not same_serial(serial, expected_serial):
         if isinstance(device, RegisterLink) and device.tolerant and await _also(device, bundle, expected_serial):
             return IdentityRead(expected_serial, values)
         answers = f"is serial {serial}" if serial else "tells no serial (its profile has no serial_register)"
-        raise WrongUnit(f"the unit on {where} {answers}, expected {expected_serial}")
+        kind = WrongUnit if register is None or number is None else _wrong(profile, register, number)
+        raise kind(f"the unit on {where} {answers}, expected {expected_serial}")
     return IdentityRead(serial, values)
 
 
@@ -73,6 +81,13 @@ async def identified(
         raise
     await require_alone(link, bundle)
     return identity
+
+
+def _wrong(profile: Profile, name: str, number: int) -> type[WrongUnit]:
+    """What it shows that a register of the identity holds an unexpected
+    number."""
+    ones = 256 ** TYPES[profile.registers[name].type].size - 1
+    return BlankIdentity if number in (0, -1, ones) else WrongUnit
 
 
 async def _also(link: RegisterLink, bundle: Bundle, serial: str) -> bool:
@@ -145,7 +160,7 @@ def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:
 
 async def read_serial(device: Device, bundle: Bundle) -> str | None:
     """The serial number as `IdentityRead` has it. Raises RegisterRefused,
-    DeviceSilent; WrongUnit where the register holds no number."""
+    DeviceSilent; BlankIdentity where the register holds no number."""
     name = bundle.profile.identity.serial_register
     return serial_text(await _read_raw_number(device, bundle, name)) if name else None
 
@@ -155,7 +170,7 @@ async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
     number = bundle.profile.raw_number(name, raw)
     if number is None:
         kind = bundle.profile.registers[name].type
-        raise WrongUnit(f"register {name} holds {raw.hex()}, which is no {kind} number")
+        raise BlankIdentity(f"register {name} holds {raw.hex()}, which is no {kind} number")
     return number
 
 

@@ -330,9 +330,6 @@ class UnitRun(UnitSession):
                 await confirmation.ask()
                 await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
 
-        assert self._confirmation is not None
-        async with self._confirmation.phase():  # the unit may have been silent when the poses ended
-            self.progress.stage(self.name, "writing the registers")
         self._write_back = WriteBack(
             self.place,
             self.station,
@@ -342,7 +339,11 @@ class UnitRun(UnitSession):
             started=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="seconds"),
             force=self.force,
         )
-        await self._write_back.run(device, image, identity.serial, tumble)
+        assert self._confirmation is not None
+        async with self._confirmation.phase():  # the unit may have been silent when the poses ended
+            self.progress.stage(self.name, "writing the registers")
+            examined = await self._write_back.examine(device, image, identity.serial, tumble)
+        await self._write_back.write(examined, tumble)
 
     def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(

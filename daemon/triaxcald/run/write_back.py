@@ -72,13 +72,11 @@ class WriteBack:
     doubts: Sequence[Doubt] = field(default=(), init=False)
     provisioning: Provisioning | None = field(default=None, init=False)
 
-    async def run(self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection) -> None:
-        """Whatever is raised on the way, the old calibration has been put back
-        before, or `held` says what is not.
-
-        Raises Implausible, Refused, with nothing written; ProvisionError,
-        StationError, DiskError.
-        """
+    async def examine(
+        self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection
+    ) -> Provisioning:
+        """Identifies the unit and reads its registers; nothing is written.
+        Raises Implausible, Refused, ProvisionError, StationError, DiskError."""
         link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer), name=self.place.device_name)
         asked = power_cycle_asked(self.ask, link, self.place, self.station)
         p = Provisioning(
@@ -101,6 +99,12 @@ class WriteBack:
         self._attach(REGISTERS_BEFORE, p.found.raw)
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
+        return p
+
+    async def write(self, p: Provisioning, tumble: Collection) -> None:
+        """Whatever is raised on the way, the old calibration has been put back
+        before, or `held` says what is not. Raises ProvisionError, StationError,
+        DiskError."""
         with p.finishing():
             await p.write()
             await self._finish(p, tumble)

@@ -10,7 +10,8 @@ from typing import Any, Protocol, cast
 
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch
-from triaxcald.provision.identity import WrongUnit
+from triaxcald.errors import TwoAnswer
+from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import ABSENT, Exchanged, Streaming
 
@@ -21,8 +22,10 @@ RETRY_S = 10.0
 """After a request that went unanswered; doubled up to `EVERY_S`, so that a unit
 that answers nothing while it streams is not disturbed for nothing."""
 SURE_S = 0.2
-"""Between two readings of a wrong identity: a unit that starts may show an empty
-register for a moment, and a single one ends no recording."""
+"""Between two readings of a wrong identity: a single one ends no recording."""
+STARTING_S = 3.0
+"""So long a unit that starts may show a blank identity: a device has loaded its
+registers in a second or two."""
 LAST_ATTEMPTS = 3
 """At the end of a phase nobody asks later: a lost reply is not the last word."""
 LAST_S = 2.0
@@ -56,6 +59,7 @@ class Confirmation:
         now_ns: Callable[[], int] = HOST.now_ns,
     ) -> None:
         self.wrong: WrongUnit | None = None
+        self._two: TwoAnswer | None = None
         self._identify, self._writer, self._recorded = identify, writer, recorded
         self._tell, self._now_ns = tell, now_ns
         self._told = self._marked = self._interrupted = False
@@ -75,20 +79,24 @@ class Confirmation:
 
     async def returned(self, identify: Callable[[], Awaitable[None]]) -> None:
         """Identifies a unit that was lost and is opened again. Raises Exchanged
-        where another unit answers twice and records have come since the right
-        one was confirmed, else what ``identify`` raises."""
-        try:
-            await identify()
-        except WrongUnit:
-            if self._confirmed[0] == self._here()[0]:
-                raise
-            await asyncio.sleep(SURE_S)
+        where records have come since the right one was confirmed and another
+        unit answers, unless the right one does at the second reading. Else
+        raises what ``identify`` does."""
+        async with self._turn:
             try:
                 await identify()
+            except TwoAnswer as e:
+                self._two = e
+                raise
             except WrongUnit as e:
-                raise Exchanged(str(e)) from e
-        if self.wrong is None:
-            self._confirmed = self._here()
+                if self._confirmed[0] == self._here()[0]:
+                    raise
+                try:
+                    await _once_more(identify, e)
+                except WrongUnit:
+                    raise Exchanged(str(e)) from e
+            if self.wrong is None:
+                self._confirmed = self._here()
 
     async def ask(self) -> bool:
         """Whether the unit has answered. What came up to the request is the
@@ -100,17 +108,18 @@ class Confirmation:
             try:
                 try:
                     await self._identify()
-                except WrongUnit:
-                    await asyncio.sleep(SURE_S)
-                    before = self._here()
-                    await self._identify()
+                except WrongUnit as e:
+                    await _once_more(self._identify, e)
             except WrongUnit as e:
                 self.wrong = e
+            except TwoAnswer as e:
+                self._two = e
+                raise
             except ABSENT as e:  # silent, busy or refusing is not wrong
                 self._note(str(e))
                 return False
             else:
-                self._confirmed = before
+                self._confirmed = max(before, self._confirmed, key=lambda c: c[0])
             return True
 
     def _note(self, trouble: str) -> None:
@@ -129,9 +138,9 @@ class Confirmation:
     @asynccontextmanager
     async def phase(self) -> AsyncIterator[None]:
         """While one phase is recorded. At its end, also when it is cancelled,
-        the unit is asked once more. Where another unit is noticed, all that
-        came since the unit was confirmed is marked as unconfirmed. Raises
-        WrongUnit."""
+        the unit is asked once more. Where another unit is noticed, also beside
+        the right one, all that came since the unit was confirmed is marked as
+        unconfirmed. Raises WrongUnit, TwoAnswer."""
         try:
             yield
         except WrongUnit as e:
@@ -142,10 +151,14 @@ class Confirmation:
                     await self._ask_at_the_end()
             if self.wrong is None:
                 raise
+        except Exception:
+            if (why := self.wrong or self._two) is not None:
+                self.disown(why)
+            raise
         else:
             await self._ask_at_the_end()
         if self.wrong is not None:
-            self.disown()
+            self.disown(self.wrong)
             raise self.wrong
 
     async def _ask_at_the_end(self) -> None:
@@ -153,18 +166,17 @@ class Confirmation:
             if await self.ask():
                 return
 
-    def disown(self) -> bool:
-        """Marks what came since the unit was confirmed as unconfirmed; whether
-        there was anything. Raises RecordingError."""
+    def disown(self, why: Exception) -> None:
+        """Marks what came since the unit was confirmed as unconfirmed. Raises
+        RecordingError."""
         if self._writer is None:
-            return False
+            return
         first, confirmed_ns, mark = self._confirmed
         if self._writer.offered == first or self._marked:
-            return self._marked
+            return
         self._marked = True
         self._recorded.back_to(mark)
-        self._writer.unconfirmed(first, {"confirmed_ns": confirmed_ns, "error": str(self.wrong)})
-        return True
+        self._writer.unconfirmed(first, {"confirmed_ns": confirmed_ns, "error": str(why)})
 
     def heed(self, batch: RawBatch) -> None:
         """Raises WrongUnit once another unit is noticed, and what else the asking
@@ -209,6 +221,26 @@ class Confirmation:
                 retry_s = RETRY_S
             else:
                 pause_s, retry_s = retry_s, min(2 * retry_s, EVERY_S)
+
+
+async def _once_more(identify: Callable[[], Awaitable[None]], wrong: WrongUnit) -> None:
+    """After a wrong identity was read. Raises it unless the right one is read
+    `SURE_S` later; a blank one may be read for `STARTING_S` before, as of a unit
+    that is starting. Raises what ``identify`` does where nothing but blanks
+    have been read and the unit is absent."""
+    blank = isinstance(wrong, BlankIdentity)
+    for _ in range(round(STARTING_S / SURE_S) if blank else 1):
+        await asyncio.sleep(SURE_S)
+        try:
+            await identify()
+        except BlankIdentity:
+            continue
+        except ABSENT:
+            if blank:
+                raise
+            raise wrong from None
+        return
+    raise wrong
 
 
 class Confirmed:

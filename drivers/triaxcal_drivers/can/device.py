@@ -209,7 +209,8 @@ class CanDevice:
                 connection.line.attention.loop.call_soon_threadsafe(booted.set)
 
     async def _start(self) -> None:
-        """NMT start, and the check that the right device is there.
+        """NMT start, and the check that a device is there that has the registers
+        of the identity. What they hold is compared by who opens it.
 
         A node that was stopped answers no SDO, one that is still booting misses
         the command: it is sent before and after the check.
@@ -223,19 +224,13 @@ class CanDevice:
         asked = [*identity.expect, *([identity.serial_register] if identity.serial_register else [])]
         for name in asked or list(self._profile.registers)[:1]:
             try:
-                raw = await self._read_when_ready(name)
+                await self._read_when_ready(name)
             except DeviceSilent as e:
                 raise DeviceAbsent(f"nothing answers at {self._settings}") from e
             except DeviceBusy as e:
                 raise DeviceAbsent(f"{self._settings} does not say for {BUSY_S:g} s what it is: {e}") from e
             except RegisterRefused as e:
                 raise DeviceAbsent(f"{self._settings} is not a {identity.product}: {e}") from e
-            expected = identity.expect.get(name)
-            if expected is not None and int.from_bytes(raw, "little") != expected:
-                raise DeviceAbsent(
-                    f"{self._settings} is not a {identity.product}: {name} is "
-                    f"0x{int.from_bytes(raw, 'little'):X}, expected 0x{expected:X}"
-                )
 
     async def _read_when_ready(self, register: str) -> bytes:
         """As `read`; a node that refuses for now, as one does that starts or

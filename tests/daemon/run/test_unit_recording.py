@@ -185,7 +185,8 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
     work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=3.0))
     await told.until("unit0", lambda text: text == "recording")
-    await asyncio.sleep(0.5)
+    while not (workshop.folder / "unit0.mcap").stat().st_size > 20_000:
+        await asyncio.sleep(0.01)
     await bench.take(0)
     await bench.put(0, serial=13)
     (kept,) = await work

@@ -83,7 +83,7 @@ class Bench:
 
     async def run(self, back: WriteBack) -> None:
         tumble = Collection(TUMBLE, self.place.bundle, self.place.address)
-        await back.run(self.device, self.image, "4711", tumble)
+        await back.write(await back.examine(self.device, self.image, "4711", tumble), tumble)
 
 
 def _state(back: WriteBack) -> DeviceState:

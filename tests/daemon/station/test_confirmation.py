@@ -13,11 +13,12 @@ import pytest
 from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.errors import BusError, DeviceBusy, DeviceRestarted, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import Gap, RawBatch
-from triaxcald.errors import StationError
-from triaxcald.provision.identity import WrongUnit
+from triaxcald.errors import StationError, TwoAnswer
+from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.station.coming_back import Patience, Returning
 from triaxcald.station.confirmation import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
 
+BLANK = BlankIdentity("the unit on node 5 is serial 0000, expected 0777")
 OTHER = WrongUnit("the unit on node 5 is serial 0888, expected 0777")
 UNANSWERED = (
     DeviceSilent("no reply"),
@@ -258,6 +259,39 @@ def test_another_unit_after_a_loss_marks_what_came_since_the_right_one_was_confi
     with pytest.raises(WrongUnit, match="0888"):
         run(unit.record(trouble))
     assert unit.marked == [0]
+
+
+def test_another_unit_that_is_lost_again_is_not_forgotten() -> None:
+    unit = Returned([OTHER, DeviceSilent("gone"), None])
+    with pytest.raises(WrongUnit, match="0888"):
+        run(unit.record(DeviceSilent("gone")))
+    assert unit.marked == [0]
+
+
+@pytest.mark.parametrize(("blanks", "ends"), [(1, False), (10, False), (40, True)])
+def test_a_unit_that_starts_may_show_a_blank_identity_for_some_seconds(blanks: int, ends: bool) -> None:
+    unit = Returned([BLANK] * blanks + [None])
+    if ends:
+        with pytest.raises(WrongUnit):
+            run(unit.record(DeviceSilent("gone")))
+    else:
+        assert run(unit.record(DeviceSilent("gone"))) == 4
+    assert unit.marked == [0] * ends
+
+
+def test_two_units_that_answer_after_a_loss_mark_what_came_since_the_confirmation() -> None:
+    """The second one may have taken the place before the right one came back."""
+    unit = Returned([TwoAnswer("two units answer")])
+    with pytest.raises(TwoAnswer):
+        run(unit.record(DeviceSilent("gone")))
+    assert unit.marked == [0]
+
+
+def test_two_units_that_answer_while_one_streams_mark_what_came_since_the_confirmation() -> None:
+    unit = Unit({0.0: None, 60.0: TwoAnswer("two units answer")})
+    with pytest.raises(TwoAnswer):
+        run(unit.record())
+    assert unit.marked[0][0] in (44, 45)
 
 
 def test_a_single_wrong_reading_after_a_loss_ends_nothing() -> None:

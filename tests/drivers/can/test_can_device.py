@@ -80,12 +80,6 @@ async def test_where_nothing_answers_the_device_is_absent(closed: CanDevice, pee
         await closed.open()
 
 
-async def test_another_product_is_not_taken_for_the_device(closed: CanDevice, peer: Peer) -> None:
-    other = (0x605, "40 18 10 02 00 00 00 00"), (0x585, "43 18 10 02 02 7a 00 00")
-    with pytest.raises(DeviceAbsent, match=r"is not a TRIAX-REF: product_code is 0x7A02, expected 0x7A01$"):
-        await asyncio.gather(closed.open(), peer.converse([(START, None), VENDOR, other]))
-
-
 async def test_a_node_without_the_identity_object_is_not_the_device(closed: CanDevice, peer: Peer) -> None:
     refused = VENDOR[0], (0x585, "80 18 10 01 00 00 02 06")
     with pytest.raises(DeviceAbsent, match=r"is not a TRIAX-REF: .*0x06020000 Object does not exist$"):
