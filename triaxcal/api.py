@@ -28,7 +28,7 @@ from triaxcal.model.moment import Moment
 from triaxcal.model.samples import Samples
 from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.poses.quality import QualityDetector, untrusted_poses
+from triaxcal.poses.quality import QualityDetector, disturbances, untrusted_poses
 from triaxcal.poses.stillness.detector import StillnessDetector
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
@@ -173,7 +173,7 @@ def find_poses(
     judge.finish()
     posterior = judge.findings(windows, spans)
     found = Poses(poses_of(windows, spans, untrusted_poses(posterior)) if windows is not None else ())
-    found.data_quality = tuple(text.quality_line(f, output_unit) for f in posterior)
+    found.data_quality = tuple(text.quality_line(f, output_unit) for f in (*posterior, *disturbances(found)))
     found.output_unit = output_unit
     return found
 

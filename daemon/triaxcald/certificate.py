@@ -35,7 +35,7 @@ from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
-from triaxcald.pipeline import Pipeline, creeping
+from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
 from triaxcald.software import drawn_with as drawn_with
@@ -106,7 +106,8 @@ def certify(
     measured_ns = pipeline.first_host_ns or 0
     held = held_by_device(profile, after)
     image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
-    quality, output_unit = pipeline.data_quality() + creeping(poses), profile.output.unit
+    output_unit = profile.output.unit
+    quality = pipeline.data_quality() + of_poses(poses, output_unit)
     if loop is None:
         result = rezero_document(after, data_quality=quality, output_unit=output_unit, stated=stated)
     else:

@@ -30,7 +30,7 @@ from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald import text
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
+from triaxcald.pipeline import DecodedStream, Pipeline, of_poses, together
 from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
@@ -120,7 +120,7 @@ def measure(
         spans = detector.spans(turn_s)
         seen = judge.findings(windows, spans)
         poses = poses_of(windows, spans, untrusted_poses(seen))
-        quality = together(counted, seen) + ([] if moments is not None else creeping(poses))
+        quality = together(counted, seen) + ([] if moments is not None else of_poses(poses, table.output_unit))
         return replace(read, poses=poses, data_quality=quality, parted=parted)
 
     return parted(turn_s)
@@ -182,7 +182,9 @@ def _measure_recording(
 
     def parted(turn_s: float | None) -> Measured:
         poses = pipeline.parted(turn_s)
-        quality = pipeline.data_quality() + lost + ([] if moments is not None else creeping(poses))
+        quality = (
+            pipeline.data_quality() + lost + ([] if moments is not None else of_poses(poses, pipeline.output_unit))
+        )
         return replace(read, poses=poses, data_quality=quality, parted=parted)
 
     return parted(turn_s)

@@ -13,13 +13,13 @@ from triaxcal import text
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
-from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
+from triaxcal.poses.quality import Finding, QualityDetector, disturbances, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
 
-__all__ = ["DecodedStream", "Pipeline", "beside_samples", "creeping", "only_finite", "together"]
+__all__ = ["DecodedStream", "Pipeline", "beside_samples", "of_poses", "only_finite", "together"]
 
 
 @dataclass
@@ -120,9 +120,11 @@ class Pipeline(DecodedStream):
             found["bus_errors"] = number_of(self.counts["errors"], "record")
         if absurd := self._implausible():
             found["implausible_readings"] = absurd
-        return together(
-            found, self._seen(self.windows), self.bundle.profile.output.unit if self.stream == READINGS else "g"
-        )
+        return together(found, self._seen(self.windows), self.output_unit)
+
+    @property
+    def output_unit(self) -> str:
+        return self.bundle.profile.output.unit if self.stream == READINGS else "g"
 
     def _implausible(self) -> str:
         """Where still readings span more than gravity does, by the nominal
@@ -165,9 +167,9 @@ def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = ""
     return [f"{name}: {what}" for name, what in said.items()]
 
 
-def creeping(poses: Sequence[Pose]) -> list[str]:
+def of_poses(poses: Sequence[Pose], unit: str = "") -> list[str]:
     """What poses are to be blamed for, likewise."""
-    found = [p for p in poses if p.creep.any()]
-    if not found:
-        return []
-    return [f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s"]
+    said = [text.quality_line(f, unit) for f in disturbances(poses)]
+    if found := [p for p in poses if p.creep.any()]:
+        said.append(f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s")
+    return said

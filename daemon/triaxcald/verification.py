@@ -20,7 +20,7 @@ from triaxcal.number_format import plain
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import degrees, error, number, probability, uncertainty
 from triaxcald.computer import compute_with_one_thread
-from triaxcald.pipeline import Pipeline, creeping
+from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.station.guidance import ups
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
@@ -121,7 +121,7 @@ def verified(pipeline: Pipeline, reference: float) -> Verification:
     Finishes the ``pipeline``."""
     compute_with_one_thread()
     poses = pipeline.finish()
-    quality = pipeline.data_quality() + creeping(poses)
+    quality = pipeline.data_quality() + of_poses(poses, pipeline.output_unit)
     return replace(verify(poses, reference), data_quality=tuple(quality))
 
 

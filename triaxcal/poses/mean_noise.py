@@ -17,7 +17,7 @@ from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.quantization import left_in_means, resolution
+from triaxcal.poses.stillness.quantization import left_in_means, resolution, widest_steps
 from triaxcal.poses.stillness.windows import Windows
 
 LONGEST = 2**17
@@ -35,7 +35,9 @@ of the quietest tenth of them."""
 class MeanNoise:
     """Of k poses, in output units: ``covariance`` (k,3,3) of the means without
     creep; ``creep`` and ``slope`` (k,3), ``slope_error`` and ``dof`` (k,),
-    ``shared_dof`` and ``levels`` as `triaxcal.poses.pose.Pose` has them."""
+    ``shared_dof`` and ``levels`` as `triaxcal.poses.pose.Pose` has them;
+    ``restless`` (k,) as `PoseNoise` has it, along the measured vector where that
+    is known."""
 
     covariance: Floats
     creep: Floats
@@ -44,6 +46,7 @@ class MeanNoise:
     dof: Floats
     shared_dof: float
     levels: NoiseLevels
+    restless: Floats
 
 
 def noise_of_means(w: Windows, spans: Sequence[Span], mean: Floats) -> MeanNoise:
@@ -51,27 +54,28 @@ def noise_of_means(w: Windows, spans: Sequence[Span], mean: Floats) -> MeanNoise
     at_once = _averaged_at_once([len(s.used) for s in spans])
     tracks = [_track(w, s, at_once) for s in spans]
     recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns / at_once
-    noise = pose_noise(tracks, recording)
+    steps = np.tile(widest_steps(w), (len(spans), 1))
+    noise = pose_noise(tracks, recording, steps=steps)
     creeping = np.asarray(noise.creeping.any(axis=1))
     length = np.array([t.place[-1] - t.place[0] for t in tracks])[:, None]
     creep = np.where(creeping[:, None], noise.slope * length, 0.0)
     covariance = np.array(
         [_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, np.sqrt(noise.variance), strict=True)]
     )
-    dof, shared_dof, levels = noise.dof.min(axis=1), noise.common_dof, noise.levels
+    dof, shared_dof, levels, restless = noise.dof.min(axis=1), noise.common_dof, noise.levels, noise.restless
     slope, slope_error = noise.slope * (length + 1), np.full(len(spans), np.inf)
     out = _outward(mean)
     if out is not None:
-        along, predicted = _along(w, spans, tracks, out, recording, creeping)
+        along, predicted = _along(w, spans, tracks, out, recording, creeping, steps)
         covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
-        dof, shared_dof, levels = along.dof[:, 0], along.common_dof, along.levels
+        dof, shared_dof, levels, restless = along.dof[:, 0], along.common_dof, along.levels, along.restless
         # A unit that turns creeps across the measured vector; along it only
         # where that shows by itself.
         slope_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
-    return MeanNoise(covariance, creep, slope, slope_error, dof, shared_dof, levels)
+    return MeanNoise(covariance, creep, slope, slope_error, dof, shared_dof, levels, restless)
 
 
 def _averaged_at_once(lengths: Sequence[int]) -> int:
@@ -118,7 +122,13 @@ def _outward(mean: Floats) -> Floats | None:
 
 
 def _along(
-    w: Windows, spans: Sequence[Span], tracks: Sequence[Track], out: Floats, recording: float, creeping: Bools
+    w: Windows,
+    spans: Sequence[Span],
+    tracks: Sequence[Track],
+    out: Floats,
+    recording: float,
+    creeping: Bools,
+    steps: Floats,
 ) -> tuple[PoseNoise, Floats]:
     """Noise of the poses along the measured vector, in units (k,) of what the
     scatter inside the windows predicts.
@@ -137,7 +147,8 @@ def _along(
     inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
     predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))
     radial = [Track(t.place, (t.deviation @ g / p)[:, None]) for t, g, p in zip(tracks, out, predicted, strict=True)]
-    return pose_noise(radial, recording, creeping), predicted
+    rounded = np.sqrt((steps**2 * out**2).sum(axis=1)) / predicted
+    return pose_noise(radial, recording, creeping, rounded[:, None]), predicted
 
 
 def _mended(covariance: Floats, out: Floats, along: Floats) -> Floats:

@@ -224,12 +224,12 @@ class Spectrum:
         return np.asarray(np.maximum(2 * held.sum(axis=1) - held[:, 0], 1e-3 * held[:, 0]))
 
 
-def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectrum, Floats]:
-    """The spectrum of every quantity, and the expected power (r,q) of every row
-    of ``p``."""
+def fitted(p: Periodogram, components: Components, typical: int, learned: Bools) -> tuple[Spectrum, Floats]:
+    """The spectrum of every quantity by the rows ``learned`` (r,) of ``p``, and
+    the expected power (r,q) of every row."""
     highest = 0.5
     while True:
-        part = p.only(p.frequency <= highest)
+        part = p.only(learned & (p.frequency <= highest))
         amplitude, levels = _averaged(part, components, typical)
         if highest / 2 * typical < 5 or _fits(part, part.expected @ amplitude.T):
             break

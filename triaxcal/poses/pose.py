@@ -14,6 +14,8 @@ from triaxcal.poses.channel_course import courses_of
 from triaxcal.poses.mean_noise import noise_of_means
 from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.stillness.detector import Span
+from triaxcal.poses.stillness.quantization import resolution
+from triaxcal.poses.stillness.shaken_parts import LOUD
 from triaxcal.poses.stillness.windows import Windows
 
 
@@ -39,6 +41,18 @@ class PoseStart:
 
 
 @dataclass(frozen=True)
+class ShakenPart:
+    """A stretch of time in which the outputs scatter by up to ``scatter``
+    (standard deviation of a sample of the axis that scatters most, output
+    units), so many ``times`` as in the rest of the pose."""
+
+    start_s: float
+    end_s: float
+    scatter: float
+    times: float
+
+
+@dataclass(frozen=True)
 class Pose:
     """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean,
     output units. ``dof`` are the degrees of freedom behind the covariance
@@ -60,7 +74,10 @@ class Pose:
     is the mean of the pose before, None in the first; ``scatter`` (3,) the
     variance of a sample inside the span, output units squared. ``fault`` is
     what its samples are to be blamed for (`triaxcal.poses.quality`), if at all:
-    no fit uses such a pose.
+    no fit uses such a pose. ``shaken`` are parts of it that its mean leaves
+    out. ``restless`` is how many times as much as most poses it scatters where
+    that is far more than they differ, which its covariance allows for; else 1.
+    ``parted``: a move that shaking hid lies between it and the pose before.
     """
 
     start_s: float
@@ -84,6 +101,9 @@ class Pose:
     noise_levels: NoiseLevels | None = field(default=None, repr=False, compare=False)
     run: Run = field(default_factory=Run)
     fault: str = ""
+    shaken: tuple[ShakenPart, ...] = ()
+    restless: float = 1.0
+    parted: bool = False
 
     def __post_init__(self) -> None:
         if self.mean.shape != (3,) or self.covariance.shape != (3, 3):
@@ -192,6 +212,24 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             bend_errors={name: course.bend_error for name, course in courses[i].items()},
             before=held[i - 1].mean if i else None,
             scatter=w.variance[s.used].mean(axis=0) * (w.size - 1) / w.size + w.mean[s.used].var(axis=0),
+            shaken=_shaken_parts(w, s),
+            restless=float(noise.restless[i]),
+            parted=s.parted,
         )
         for i, s in enumerate(spans)
     ]
+
+
+def _shaken_parts(w: Windows, s: Span) -> tuple[ShakenPart, ...]:
+    if not len(s.shaken):
+        return ()
+    begin, usual = int(w.start_ns[0]), np.maximum(w.variance[s.used].mean(axis=0), resolution(w) ** 2 / 12)
+    parts = []
+    for at in np.split(s.shaken, np.flatnonzero(np.diff(s.shaken) > 1) + 1):
+        start_s, end_s = (int(w.start_ns[at[0]]) - begin) * 1e-9, (int(w.end_ns[at[-1]]) - begin) * 1e-9
+        loud = (w.variance[at] > LOUD**2 * usual).any(axis=1)
+        variance = w.variance[at[loud] if loud.any() else at].mean(axis=0)
+        axis = int(np.argmax(variance / usual))
+        scatter, times = np.sqrt(variance[axis]), np.sqrt(variance[axis] / usual[axis])
+        parts.append(ShakenPart(start_s, end_s, float(scatter), float(times)))
+    return tuple(parts)

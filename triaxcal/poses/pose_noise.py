@@ -4,7 +4,9 @@ together.
 The shape of the noise's spectrum is one unit's, so it is estimated from all
 poses; its size is each pose's own, shrunk towards the common one as far as the
 poses agree (empirical Bayes of variances; Smyth 2004, Stat. Appl. Genet. Mol.
-Biol. 3:3).
+Biol. 3:3). A restless pose, shaken or held by hand among others that lie still,
+has a noise of its own: it would raise the common one (as the hypervariable
+genes of Phipson et al. 2016, Ann. Appl. Stat. 10:946).
 """
 
 from __future__ import annotations
@@ -18,11 +20,22 @@ from scipy import special
 from triaxcal.arrays import Bools, Floats
 from triaxcal.distributions import normal_isf
 from triaxcal.poses.mean_variance_mixture import NoiseLevels
-from triaxcal.poses.noise_spectrum import Components, Spectrum, Track, fitted, periodogram
+from triaxcal.poses.noise_spectrum import Components, Periodogram, Spectrum, Track, fitted, periodogram
 from triaxcal.poses.tones import without_tones
 
 FALSE_CREEP = 0.01
 """Probability that a recording of still poses shows a creeping one."""
+RESTLESS = 3.0
+"""Times the scatter of most poses: less does not raise the common noise, nor is
+it worth a word."""
+RESTLESS_SIGMA = 6.0
+"""And so many standard deviations of the logarithm of the poses' variances above
+their median, by chance or as these differ: poses held by hand differ by much."""
+JUDGES = 6
+"""Poses of which a median says what is usual."""
+SLOWEST_ORDINATES = 4
+"""The noise that moves the mean of a restless pose is that of its slowest
+ordinates, where these are louder than the rest: its spectrum is its own."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +46,8 @@ class PoseNoise:
     more than chance. What the variances of all poses have in common is the
     shape of the spectrum: ``levels`` say what it may make them, of the quantity
     that is known least, and ``common_dof`` the same as degrees of freedom.
+    ``restless`` (k,) is how many times as much as most poses a pose scatters
+    that is not as they are; 1 for these.
     """
 
     variance: Floats
@@ -43,6 +58,7 @@ class PoseNoise:
     limit: float
     levels: NoiseLevels
     common_dof: float
+    restless: Floats
 
     @property
     def creeping(self) -> Bools:
@@ -50,30 +66,37 @@ class PoseNoise:
         return np.asarray(np.abs(self.significance) > self.limit)
 
 
-def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None = None) -> PoseNoise:
+def pose_noise(
+    tracks: Sequence[Track], recording: float, creeping: Bools | None = None, steps: Floats | None = None
+) -> PoseNoise:
     """``recording`` is its length in windows. ``creeping`` (k,) are poses known
-    to creep; without it they are found."""
+    to creep; without it they are found. ``steps`` (k,q): how far the steps of
+    the output may move the mean of a window, which makes no pose restless.
+    """
     cleaned = [without_tones(t) for t in tracks]
     tracks = [c.track for c in cleaned]
     slope = np.array([t.centred() @ t.deviation / (t.centred() @ t.centred()) for t in tracks])
     straight = [Track(t.place, t.deviation - t.centred()[:, None] * s) for t, s in zip(tracks, slope, strict=True)]
     limit = float(normal_isf(FALSE_CREEP / (2 * slope.size)))
+    moves = np.array([t.deviation.std(axis=0) for t in straight]) > (0.0 if steps is None else RESTLESS * steps)
     if creeping is None:
         # What creeps must not pass for slow noise: the first look is at what a
         # straight line leaves.
-        model = _Model.of(straight, recording, lowest=2)
+        model = _Model.of(straight, recording, moves, lowest=2)
         for _ in range(2):
             before: Bools | None = creeping
             creeping = np.asarray((np.abs(model.significance(tracks, slope)) > limit).any(axis=1))
             if before is not None and np.array_equal(before, creeping):
                 break
-            model = _Model.of(_mixed(tracks, straight, creeping), recording)
+            model = _Model.of(_mixed(tracks, straight, creeping), recording, moves)
     else:
-        model = _Model.of(_mixed(tracks, straight, creeping), recording)
+        model = _Model.of(_mixed(tracks, straight, creeping), recording, moves)
     significance = model.significance(tracks, slope)
     variance = model.mean_variance(tracks) + np.array([c.variance for c in cleaned])
     error = model.slope_error(tracks) + model.vibration_slope(tracks)
-    return PoseNoise(variance, model.dof(), slope, error, significance, limit, model.levels, model.common_dof)
+    return PoseNoise(
+        variance, model.dof(), slope, error, significance, limit, model.levels, model.common_dof, model.restlessness()
+    )
 
 
 def _mixed(tracks: Sequence[Track], straight: Sequence[Track], creeping: Bools) -> list[Track]:
@@ -81,37 +104,87 @@ def _mixed(tracks: Sequence[Track], straight: Sequence[Track], creeping: Bools) 
 
 
 @dataclass(frozen=True)
+class _Power:
+    """What the poses show: their ``periodogram``, the ``components`` that may
+    make it, and their own ``scatter`` (k,q) with its degrees of freedom (k,).
+    """
+
+    periodogram: Periodogram
+    components: Components
+    typical: int
+    scatter: Floats
+    dof: Floats
+    slowest: Bools
+    """Rows of the periodogram that say most of a pose's mean."""
+
+    @classmethod
+    def of(cls, tracks: Sequence[Track], recording: float, lowest: int) -> _Power:
+        typical = max(int(np.median([t.length for t in tracks])), 3)
+        length = np.array([t.length for t in tracks])
+        longest = int(length.max())
+        components = Components.of(max(typical, longest), typical, recording)
+        own = np.array([(t.deviation**2).sum(axis=0) / max(len(t) - 1, 1) for t in tracks])
+        own = np.maximum(own, 1e-12 * own.max(axis=0, initial=0.0) + 1e-300)
+        p = periodogram(tracks, components, lowest if longest // 2 >= lowest + 2 else 1)
+        slowest = p.frequency * length[p.pose] < SLOWEST_ORDINATES + 0.5
+        return cls(p, components, typical, own, np.array([max(len(t) - 1.0, 1.0) for t in tracks]), slowest)
+
+    def heard(self, expected: Floats, rows: Floats) -> tuple[Floats, Floats]:
+        """(k,q) mean power of each pose over the ``expected`` (r,q), in these
+        ``rows`` (r,1) by their weights, and its degrees of freedom."""
+        p = self.periodogram
+        heard, dof = np.zeros((2, *self.scatter.shape))
+        np.add.at(heard, p.pose, rows * p.power / np.maximum(expected, 1e-300))
+        np.add.at(dof, p.pose, 2 * rows)
+        dof = np.maximum(dof, 1e-3)
+        return np.maximum(2 * heard / dof, 1e-12), dof
+
+
+@dataclass(frozen=True)
 class _Model:
-    """The common spectrum, and by how much (k,q) each pose's noise is above it."""
+    """The common spectrum, and by how much (k,q) each pose's noise is above it;
+    ``own`` is the same by its own
+    scatter alone, of ``own_dof`` degrees of freedom. ``restless`` (k,) poses are
+    no part of what is common."""
 
     spectrum: Spectrum
     scale: Floats
     scale_dof: Floats
+    own: Floats
+    own_dof: Floats
+    restless: Bools
 
     @classmethod
-    def of(cls, tracks: Sequence[Track], recording: float, lowest: int = 1) -> _Model:
-        typical = max(int(np.median([t.length for t in tracks])), 3)
-        lags = max(typical, *(t.length for t in tracks))
-        components = Components.of(lags, typical, recording)
-        own = np.array([(t.deviation**2).sum(axis=0) / max(len(t) - 1, 1) for t in tracks])
-        floor = 1e-12 * own.max(axis=0, initial=0.0) + 1e-300
-        own = np.maximum(own, floor)
-        scale, _ = shrunk(own / np.median(own, axis=0), np.array([max(len(t) - 1.0, 1.0) for t in tracks]))
-        longest = max(t.length for t in tracks)
-        p = periodogram(tracks, components, lowest if longest // 2 >= lowest + 2 else 1)
+    def of(cls, tracks: Sequence[Track], recording: float, moves: Bools, lowest: int = 1) -> _Model:
+        """``moves`` (k,q): what scatters by more than the steps of the output,
+        and may be restless."""
+        power = _Power.of(tracks, recording, lowest)
+        model = cls._fitted(power, np.zeros(len(tracks), dtype=bool))
         for _ in range(2):
-            even = type(p)(p.power / scale[p.pose], p.expected, p.weight, p.frequency, p.pose)
-            spectrum, expected = fitted(even, components, typical)
+            restless = np.asarray((_outlying(model.own, model.own_dof) & moves).any(axis=1))
+            if np.array_equal(restless, model.restless) or restless[power.periodogram.pose].all():
+                break
+            model = cls._fitted(power, restless)
+        return model
+
+    @classmethod
+    def _fitted(cls, power: _Power, restless: Bools) -> _Model:
+        p, usual = power.periodogram, ~restless
+        scale, _ = shrunk(power.scatter / np.median(power.scatter[usual], axis=0), power.dof, usual)
+        for _ in range(2):
+            even = Periodogram(p.power / scale[p.pose], p.expected, p.weight, p.frequency, p.pose)
+            spectrum, expected = fitted(even, power.components, power.typical, usual[p.pose])
             used = (p.frequency[:, None] <= spectrum.highest) * p.weight[:, None]
-            heard, dof = np.zeros((2, *scale.shape))
-            np.add.at(heard, p.pose, used * p.power / np.maximum(expected, 1e-300))
-            np.add.at(dof, p.pose, 2 * used)
-            dof = np.maximum(dof, 1e-3)
+            own, dof = power.heard(expected, used)
             before = scale
-            scale, scale_dof = shrunk(np.maximum(2 * heard / dof, 1e-12), dof)
+            scale, scale_dof = shrunk(own, dof, usual)
             if np.allclose(scale / before, (scale / before).mean(axis=0), rtol=0.01):
                 break
-        return cls(spectrum, scale, scale_dof)
+        if restless.any():
+            slow, slow_dof = power.heard(expected, used * power.slowest[:, None])
+            louder = restless[:, None] & (slow > scale)
+            scale, scale_dof = np.where(louder, slow, scale), np.where(louder, slow_dof, scale_dof)
+        return cls(spectrum, scale, scale_dof, own, dof, restless)
 
     def mean_variance(self, tracks: Sequence[Track]) -> Floats:
         return np.asarray(self.scale * np.array([self.spectrum.variance_of_mean(t) for t in tracks]))
@@ -138,6 +211,11 @@ class _Model:
         size = np.array([np.sqrt(2 * (t.deviation**2).mean(axis=0)) / t.length**2 for t in tracks])
         return np.asarray(6 * size / np.sin(np.pi * self.spectrum.highest))
 
+    def restlessness(self) -> Floats:
+        """(k,)"""
+        times = np.sqrt((self.own / np.median(self.own, axis=0)).max(axis=1))
+        return np.where(self.restless, times, 1.0)
+
     @property
     def levels(self) -> NoiseLevels:
         return self.spectrum.levels[int(np.argmin(self.spectrum.dof))]
@@ -151,12 +229,30 @@ class _Model:
         return np.asarray(1 / (1 / self.spectrum.dof + 1 / self.scale_dof))
 
 
-def shrunk(own: Floats, dof: Floats) -> tuple[Floats, Floats]:
+def _outlying(own: Floats, dof: Floats) -> Bools:
+    """(k,q) variances (k,q) far above those of most poses."""
+    if len(own) < JUDGES:
+        return np.zeros(own.shape, dtype=bool)
+    log = np.log(own)
+    above = log - np.median(log, axis=0)
+    spread = 1.4826 * np.median(np.abs(above), axis=0)
+    sigma = np.maximum(spread, np.sqrt(special.polygamma(1, dof / 2)))
+    return np.asarray(above > np.maximum(RESTLESS_SIGMA * sigma, 2 * np.log(RESTLESS)))
+
+
+def shrunk(own: Floats, dof: Floats, usual: Bools | None = None) -> tuple[Floats, Floats]:
     """Variances (k,q) of ``dof`` degrees of freedom, (k,) or (k,q), shrunk
     towards their common value, and the degrees of freedom (k,q) that they have
     then; infinite where the poses agree, as the common value is all there is.
+    What is common is that of the ``usual`` ones (k,); the others stay as they
+    are.
     """
     dof = np.broadcast_to(dof if dof.ndim == 2 else dof[:, None], own.shape)
+    if usual is not None and not usual.all():
+        out = own.copy(), dof.astype(float)
+        for values, of in zip(out, shrunk(own[usual], dof[usual]), strict=True):
+            values[usual] = of
+        return out
     common = (own * dof).sum(axis=0) / dof.sum(axis=0)
     prior = np.full(own.shape[1], np.inf)
     if len(own) > 2:

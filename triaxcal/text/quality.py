@@ -92,6 +92,37 @@ def _(found: of.CoarseQuantization, unit: str = "") -> str:
     )
 
 
+@quality.register
+def _(found: of.DisturbedPoses, unit: str = "") -> str:
+    named = [_disturbance(d, _behind(unit)) for d in found.disturbances[:POSES_NAMED]]
+    more = len(found.disturbances) - POSES_NAMED
+    return f"{len(found.disturbed)} of {found.of}; {'; '.join(named)}" + (f"; and {more} more" if more > 0 else "")
+
+
+def _disturbance(d: of.Disturbance, unit: str) -> str:
+    pose = f"the pose that begins at {d.pose_s:.1f} s"
+    if d.stretch_s is None:
+        return f"{pose} scatters {_times(d.times)} as much as most, and its standard error says so"
+    begin, end = d.stretch_s
+    return (
+        f"{pose} is shaken from {begin:.1f} to {end:.1f} s by {d.scatter:.2g}{unit}, {_times(d.times)} the scatter of "
+        "its rest, and the mean leaves that out"
+    )
+
+
+def _times(factor: float) -> str:
+    return f"{factor:.0f} times" if factor >= 10 else f"{factor:.2g} times"
+
+
+@quality.register
+def _(found: of.MergedPoses, unit: str = "") -> str:
+    return "; ".join(
+        f"shaking hides a move between {m.start_s:.1f} and {m.end_s:.1f} s, {m.axis} by {m.apart:.2g}{_behind(unit)}: "
+        "two poses"
+        for m in found.moves
+    )
+
+
 def _behind(unit: str) -> str:
     return f" {unit}" if unit else ""
 

@@ -2,6 +2,7 @@
 outputs, gaps, mains, coarse steps."""
 
 from triaxcal.poses.quality.detector import QualityDetector
+from triaxcal.poses.quality.disturbed import disturbances
 from triaxcal.poses.quality.finding import Finding, untrusted_poses
 
-__all__ = ["Finding", "QualityDetector", "untrusted_poses"]
+__all__ = ["Finding", "QualityDetector", "disturbances", "untrusted_poses"]

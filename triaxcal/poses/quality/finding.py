@@ -152,6 +152,46 @@ class CoarseQuantization(Finding):
     axes: tuple[Steps, ...]
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """Of the pose that begins at ``pose_s``: a stretch of time that its mean
+    leaves out, or the whole pose (None). The outputs scatter so many ``times``
+    as in the rest of the pose, or as in most poses; of a stretch ``scatter`` is
+    a standard deviation, output units."""
+
+    pose_s: float
+    stretch_s: tuple[float, float] | None
+    times: float
+    scatter: float | None
+
+
+@dataclass(frozen=True)
+class DisturbedPoses(Finding):
+    """``disturbed`` are the indices of the poses, of so many."""
+
+    name: ClassVar[str] = "disturbed_pose"
+    disturbances: tuple[Disturbance, ...]
+    disturbed: tuple[int, ...]
+    of: int
+
+
+@dataclass(frozen=True)
+class Move:
+    """From one pose to the next, between these times, by ``apart`` in the
+    output that changes most."""
+
+    start_s: float
+    end_s: float
+    axis: str
+    apart: float
+
+
+@dataclass(frozen=True)
+class MergedPoses(Finding):
+    name: ClassVar[str] = "merged_poses"
+    moves: tuple[Move, ...]
+
+
 def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
     """By index, the still spans in which the outputs do not follow the
     acceleration, with the name of the fault."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from triaxcal.errors import TooShort
 from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrast, contrasts, unbroken
 from triaxcal.poses.stillness.quantization import Rounding, resolution
 from triaxcal.poses.stillness.shaken import ALONE_S, MOVE_SIGMA, runs, shaken_noise, shaken_runs
+from triaxcal.poses.stillness.shaken_parts import disturbances, parted, worth_keeping
 from triaxcal.poses.stillness.trimming import GUARD, SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.poses.stillness.turns import without_turns
 from triaxcal.poses.stillness.windows import RATE_LEAST, WindowCutter, Windows, window_size
@@ -60,11 +61,15 @@ class Span:
     that no bump disturbs.
 
     ``since_s`` is how long the disturbance before it lasted, where that left
-    the mean as it was; else infinite.
+    the mean as it was; else infinite. ``shaken`` (j,) are the windows of its
+    disturbances, of which ``used`` has none. ``parted``: a move that shaking
+    hid lies between this span and the one before.
     """
 
     used: Ints
     since_s: float = math.inf
+    shaken: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    parted: bool = False
 
     @property
     def first(self) -> int:
@@ -156,10 +161,35 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
         kept, longest = sorted([*pieces, *shaken], key=lambda p: int(p[0])), REJOIN_S
     else:
         kept, longest = without_turns(w, pieces, shaken), turn_s
-    spans = _rejoin(w, kept, noise, disturbed, longest)
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
-    return [s for s in spans if _long_enough(w, s.used, SPAN_LEAST_S if quiet[s.used].any() else ALONE_S)]
+    poses = _rejoined(w, kept, noise, disturbed, longest)
+    return [span for pose, since_s in poses for span in _spans_of(w, pose, quiet, noise, since_s)]
+
+
+def _spans_of(w: Windows, pose: list[Ints], quiet: Bools, noise: NoiseScales, since_s: float) -> list[Span]:
+    """The spans, long enough, of what was taken for one pose: more than one
+    where shaking hid a move."""
+    spans: list[Span] = []
+    for part in parted(w, pose, [bool(quiet[p[0]]) for p in pose], noise):
+        used, shaken = _without_shaken(w, part, quiet, noise)
+        if _long_enough(w, used, SPAN_LEAST_S if quiet[used].any() else ALONE_S):
+            disturbed = disturbances(w, used, shaken)
+            spans.append(Span(used, math.inf if spans else since_s, disturbed, parted=bool(spans)))
+    return spans
+
+
+def _without_shaken(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScales) -> tuple[Ints, Ints]:
+    """The windows of a pose that its mean is taken over, and the shaken ones
+    that would make it worse."""
+    still = [p for p in part if quiet[p[0]]]
+    if not still or not _long_enough(w, np.concatenate(still), SPAN_LEAST_S):
+        return np.concatenate(part), np.zeros(0, dtype=np.int64)
+    known = np.concatenate(still)
+    kept = [bool(quiet[p[0]]) or worth_keeping(w, p, known, noise) for p in part]
+    shaken = [p for p, k in zip(part, kept, strict=True) if not k]
+    used = [p for p, k in zip(part, kept, strict=True) if k]
+    return np.concatenate(used), np.concatenate([np.zeros(0, dtype=np.int64), *shaken])
 
 
 def _rounding(step: Floats, quiet: Floats) -> Rounding:
@@ -367,23 +397,26 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     return np.asarray(np.unique(at[out][:, None] + np.arange(scale)), dtype=np.int64)
 
 
-def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float) -> list[Span]:
+def _rejoined(
+    w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float
+) -> list[tuple[list[Ints], float]]:
     """Pieces of one pose on either side of a bump, which is shorter than
-    ``longest_s``, put together."""
+    ``longest_s``, put together; and how long the disturbance before lasted, as
+    `Span` has it."""
     period_s = w.period_ns * 1e-9
-    spans: list[Span] = []
+    poses: list[tuple[list[Ints], float]] = []
     for piece in pieces:
-        here = spans[-1].last if spans else 0
+        here = int(poses[-1][0][-1][-1]) if poses else 0
         silent_s = (w.start_ns[piece[0]] - w.start_ns[here]) * 1e-9 - (piece[0] - here) * period_s
         between = np.flatnonzero(disturbed[here : piece[0]])
         bump_s = float(np.ptp(between) + 1 if len(between) else 0) * period_s + max(silent_s, 0.0)
-        if not spans or not _same_pose(w, spans[-1].used, piece, noise):
-            spans.append(Span(piece))
+        if not poses or not _same_pose(w, np.concatenate(poses[-1][0]), piece, noise):
+            poses.append(([piece], math.inf))
         elif bump_s < longest_s:
-            spans[-1] = replace(spans[-1], used=np.concatenate([spans[-1].used, piece]))
+            poses[-1][0].append(piece)
         else:
-            spans.append(Span(piece, bump_s))
-    return spans
+            poses.append(([piece], bump_s))
+    return poses
 
 
 def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> bool:

@@ -30,6 +30,8 @@ ALIKE = 0.25
 MOSTLY, SINGLE = 0.9, 0.6
 """So many of these windows differ by a step, or by two or three where the unit
 moves; so many by one."""
+MOSTLY_COARSE = 0.5
+"""Of the windows: there the noise hardly shows for the steps."""
 OTHERWISE = 1.5
 """A step so many times the smallest difference is no matter of which readings
 happened to be seen."""
@@ -116,6 +118,18 @@ def shown_step(w: Windows) -> Floats:
         agree = np.mean(alike) >= MOSTLY and np.mean(alike & (times == 1)) >= SINGLE
         if agree and step * COARSEST < np.ptp(w.mean[:, i]):
             out[i] = step
+    return out
+
+
+def widest_steps(w: Windows) -> Floats:
+    """(3,) the differences of readings in windows that hold two readings only,
+    where most windows hold no more: steps of the output, or the dead band of a
+    logger, which is several of them. Elsewhere the resolution."""
+    out = resolution(w)
+    for i in range(3):
+        hops = w.hop[w.hop[:, i] > 0, i]
+        if len(hops) and np.mean((w.hop[:, i] > 0) | (w.variance[:, i] == 0)) > MOSTLY_COARSE:
+            out[i] = max(out[i], float(np.median(hops)))
     return out
 
 
