@@ -20,6 +20,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.poses.quality import disturbances
 from triaxcal.poses.stillness.detector import StillnessDetector
 
 FOLDER = Path(__file__).parents[3] / "shared" / "datasets"
@@ -67,6 +68,12 @@ def equal_weights_rss(means: np.ndarray) -> float:
 
     first = np.array([1, 0, 0, 1, 0, 1, 0, 0, 0], dtype=float)
     return float(np.sum(least_squares(miss, first, xtol=1e-15, ftol=1e-15, gtol=1e-15).fun ** 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*/*.csv.gz")), ids=lambda p: f"{p.parent.name}-{p.name}")
+def test_no_pose_that_was_held_in_earnest_is_called_disturbed(path: Path, poses: Poses) -> None:
+    assert disturbances(poses(f"{path.parent.name}/{path.name.removesuffix('.csv.gz')}")) == []
 
 
 @pytest.mark.slow

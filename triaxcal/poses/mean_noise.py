@@ -159,6 +159,11 @@ def _mended(covariance: Floats, out: Floats, along: Floats) -> Floats:
 
 
 def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
-    """(3,) variance of what rounding of the outputs leaves in a mean."""
+    """(3,) variance of what rounding of the outputs leaves in a mean, where no
+    shaking averages it out."""
     scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans])
-    return left_in_means(w, scatter, np.array([len(s.used) for s in spans]))
+    # Half-way between two steps readings have a variance of a quarter.
+    usual = np.maximum(np.median(scatter, axis=0), resolution(w) ** 2 / 4)
+    quiet = np.asarray((scatter <= SHAKEN * usual).all(axis=1))
+    quiet |= not quiet.any()
+    return left_in_means(w, scatter[quiet], np.array([len(s.used) for s in spans])[quiet])

@@ -41,6 +41,10 @@ STEPS = 12
 everywhere; each step costs as much as the first."""
 FLICKER = 0.3
 """Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
+GAPS = 1 / 3
+"""Share of a pose that is missing from which on it is reckoned what its mean
+takes from the slow noise (`_taken_by_the_mean`). Bumps leave gaps of less; after
+a long disturbance 1/f noise would be taken for a third of what it is."""
 PART = 2**22
 """Numbers that are held at once for each of the few arrays that a long pose
 takes: 32 MiB."""
@@ -185,11 +189,35 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
         for part in components.parts(n):
             weighted = part * pairs
             expected = (2 * fft.rfft(weighted, axis=1).real - weighted[:, :1]).T / len(track)
+            if len(track) < (1 - GAPS) * n:
+                expected = expected - _taken_by_the_mean(track, part, weighted)
             sums.append(np.add.reduceat(expected[j] * weight[:, None], first, axis=0))
         means = [np.asarray(s / total[:, None]) for s in (sums[0], np.concatenate(sums[1:], axis=1))]
         centre = np.add.reduceat(j * weight, first) / total / n
         rows.append((means[0], means[1], total, centre, np.full(len(first), number)))
     return Periodogram(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def _taken_by_the_mean(track: Track, autocovariance: Floats, weighted: Floats) -> Floats:
+    """(n//2+1,c) by how much the expected power of a track with gaps falls where
+    its mean is subtracted; without gaps not at all, but at frequency zero.
+
+    For the transform X of the readings and M of the windows that are there, of
+    which there are m, the transform becomes X(f) − M(f) X(0)/m.
+    """
+    n = track.length
+    there = np.zeros(n)
+    there[track.place - track.place[0]] = 1.0
+    size = fft.next_fast_len(2 * n, real=True)
+    both = np.zeros((len(autocovariance), size))
+    both[:, :n] = autocovariance
+    both[:, size - n + 1 :] = autocovariance[:, :0:-1]
+    # The covariance of each reading with the sum of all.
+    with_sum = fft.irfft(fft.rfft(both, axis=1) * fft.rfft(there, size), size, axis=1)[:, :n] * there
+    of_mean = (2 * weighted.sum(axis=1) - weighted[:, 0]) / len(track) ** 2
+    mask = fft.rfft(there)
+    crossed = 2 * (fft.rfft(with_sum, axis=1) * mask.conj()).real / len(track)
+    return np.asarray((crossed - np.abs(mask) ** 2 * of_mean[:, None]).T / len(track))
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,9 @@ class _Power:
     typical: int
     scatter: Floats
     dof: Floats
+    hops: Floats
+    """(k,q) half the mean square difference of neighbouring windows, which no
+    slow noise raises."""
     slowest: Bools
     """Rows of the periodogram that say most of a pose's mean."""
 
@@ -127,7 +130,8 @@ class _Power:
         own = np.maximum(own, 1e-12 * own.max(axis=0, initial=0.0) + 1e-300)
         p = periodogram(tracks, components, lowest if longest // 2 >= lowest + 2 else 1)
         slowest = p.frequency * length[p.pose] < SLOWEST_ORDINATES + 0.5
-        return cls(p, components, typical, own, np.array([max(len(t) - 1.0, 1.0) for t in tracks]), slowest)
+        hops = np.array([(np.diff(t.deviation, axis=0) ** 2).mean(axis=0) / 2 for t in tracks])
+        return cls(p, components, typical, own, np.array([max(len(t) - 1.0, 1.0) for t in tracks]), hops, slowest)
 
     def heard(self, expected: Floats, rows: Floats) -> tuple[Floats, Floats]:
         """(k,q) mean power of each pose over the ``expected`` (r,q), in these
@@ -160,8 +164,10 @@ class _Model:
         and may be restless."""
         power = _Power.of(tracks, recording, lowest)
         model = cls._fitted(power, np.zeros(len(tracks), dtype=bool))
+        # Differences of white noise have 2/3 of its degrees of freedom.
+        hopping = _outlying(np.maximum(power.hops, 1e-300), power.dof[:, None] / 1.5)
         for _ in range(2):
-            restless = np.asarray((_outlying(model.own, model.own_dof) & moves).any(axis=1))
+            restless = np.asarray(((_outlying(model.own, model.own_dof) | hopping) & moves).any(axis=1))
             if np.array_equal(restless, model.restless) or restless[power.periodogram.pose].all():
                 break
             model = cls._fitted(power, restless)

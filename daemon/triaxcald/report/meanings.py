@@ -39,6 +39,8 @@ QUALITY = {
     "malformed_records": "Records not as the profile defines them",
     "mains_pickup": "Mains hum",
     "coarse_quantization": "Steps of the output too coarse",
+    "disturbed_pose": "Pose shaken",
+    "merged_poses": "Move hidden by shaking",
     "creeping_pose": "Outputs creep while the pose is held",
     "unknown_noise": "Noise of the pose means not known",
 }

@@ -78,6 +78,20 @@ def test_the_expected_periodogram_is_that_of_the_whole_covariance_matrix() -> No
             assert p.expected[j - 1, i] == pytest.approx(power, abs=1e-9)
 
 
+def test_the_expected_periodogram_of_a_pose_with_a_long_gap_is_without_what_its_mean_takes() -> None:
+    n, place = 23, np.r_[0:8, 15:23]
+    c = Components.of(n, 23.0, 300.0)
+    p = periodogram([Track(place, np.zeros((len(place), 1)))], c)
+    there = np.zeros(n)
+    there[place] = 1.0
+    less_mean = np.diag(there) - np.outer(there, there) / len(place)
+    for j in range(1, 8):  # those above stand in bands
+        wave = np.exp(-2j * np.pi * j * np.arange(n) / n) @ less_mean
+        for i, row in enumerate(c.autocovariance):
+            power = (wave.conj() @ linalg.toeplitz(row) @ wave).real / len(place)
+            assert p.expected[j - 1, i] == pytest.approx(power, abs=1e-9)
+
+
 def poses_in(noise: np.ndarray, count: int, seconds: float, gap_s: float) -> tuple[list[Pose], np.ndarray]:
     """Poses of ``seconds`` at 100 Hz in noise, whose spans are known, about directions all over the sphere."""
     step = int((seconds + gap_s) * 100)

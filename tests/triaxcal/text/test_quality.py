@@ -7,11 +7,15 @@ import pytest
 from triaxcal.poses.quality.finding import (
     AtRail,
     CoarseQuantization,
+    Disturbance,
+    DisturbedPoses,
     DuplicateSamples,
     Finding,
     Freeze,
     MainsPickup,
+    MergedPoses,
     MissingSamples,
+    Move,
     Saturation,
     SlowUpdate,
     Steps,
@@ -54,6 +58,24 @@ LINES: list[tuple[Finding, str]] = [
     (
         CoarseQuantization((Steps("x", 2.4e-3, 1e-4, 1.2e-3),)),
         "coarse_quantization: x in steps of 0.0024 V, scatter 0.0001 V, pose means off by up to 0.0012 V",
+    ),
+    (
+        DisturbedPoses((Disturbance(88.1, (90.1, 91.9), 103.4, 0.0246),), (11,), 26),
+        "disturbed_pose: 1 of 26; the pose that begins at 88.1 s is shaken from 90.1 to 91.9 s by 0.025 V, 103 times "
+        "the scatter of its rest, and the mean leaves that out",
+    ),
+    (
+        DisturbedPoses(tuple(Disturbance(10.0 * i, None, 4.56, None) for i in range(9)), tuple(range(9)), 60),
+        "disturbed_pose: 9 of 60; "
+        + "; ".join(
+            f"the pose that begins at {10 * i}.0 s scatters 4.6 times as much as most, and its standard error says so"
+            for i in range(8)
+        )
+        + "; and 1 more",
+    ),
+    (
+        MergedPoses((Move(158.9, 161.1, "x", 0.117),)),
+        "merged_poses: shaking hides a move between 158.9 and 161.1 s, x by 0.12 V: two poses",
     ),
 ]
 
