@@ -229,7 +229,9 @@ def test_a_move_that_shaking_hides_is_named_with_its_size(fourteen: np.ndarray) 
 
 @pytest.mark.slow
 def test_hundreds_of_clean_recordings_show_no_disturbance() -> None:
-    kinds = [c for c in COVARIATES if not (c.vibration_g or c.jitter_g or c.rate_hz > 100 or c.hold_s[0] > 60)]
+    kinds = [
+        c for c in COVARIATES if not (c.vibration_g or c.jitter_g or c.bump_g or c.rate_hz > 100 or c.hold_s[0] > 60)
+    ]
     for c in kinds:
         for seed in range(300 // len(kinds)):
             stream = stream_of(c, seed)

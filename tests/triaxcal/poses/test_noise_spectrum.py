@@ -79,7 +79,7 @@ def test_the_expected_periodogram_is_that_of_the_whole_covariance_matrix() -> No
 
 
 def test_the_expected_periodogram_of_a_pose_with_a_long_gap_is_without_what_its_mean_takes() -> None:
-    n, place = 23, np.r_[0:8, 15:23]
+    n, place = 23, np.r_[0:7, 16:23]
     c = Components.of(n, 23.0, 300.0)
     p = periodogram([Track(place, np.zeros((len(place), 1)))], c)
     there = np.zeros(n)
