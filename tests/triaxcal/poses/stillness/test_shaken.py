@@ -151,5 +151,8 @@ def test_shaken_poses_are_the_same_in_blocks_of_any_size(fourteen: np.ndarray) -
             pieces.spans()
     for d in (whole, pieces):
         d.finish()
-    assert [s.used.tolist() for s in pieces.spans()] == [s.used.tolist() for s in whole.spans()]
+    found, expected = pieces.spans(), whole.spans()
+    assert [(s.used.tolist(), s.shaken.tolist(), s.parted) for s in found] == [
+        (s.used.tolist(), s.shaken.tolist(), s.parted) for s in expected
+    ]
     assert len(whole.spans()) == 14
