@@ -6,16 +6,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
+from triaxcal.estimate.calibration import Residual
+from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.prior import Odds
+from triaxcal.number_format import plain
 from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
-from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
+from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_do
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
-__all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
+__all__ = ["advice", "averaged", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]
 
 EVEN = 0.5
 """Probability from which on it is likelier than not that nothing acts."""
@@ -33,13 +36,27 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     and what to do. ``following`` is the next recording where a station knows
     more of the reference than the poses tell."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
-    before, after = (c.residual.rms_g for c in (loop.before, loop.after))
     return (
         call(loop.call),
-        cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
-        errors(before, after, following or loop.next_recording, small),
+        "; ".join(
+            filter(
+                None,
+                (
+                    cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
+                    averaged(loop.averaged),
+                ),
+            )
+        ),
+        errors(loop.before.residual, loop.after.residual, loop.held_out, following or loop.next_recording, small),
         to_do(loop, small),
     )
+
+
+def averaged(weights: Mapping[str, float]) -> str:
+    """What the correction holds of effects that are neither found nor likely;
+    empty where it holds none."""
+    each = ", ".join(f"{name} ({chance(p)})" for name, p in weights.items())
+    return f"the correction averages over what may act, each by its probability: {each}" if each else ""
 
 
 def call(found: Recommendation) -> str:
@@ -120,11 +137,24 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     return said
 
 
-def errors(before_rms: float, after_rms: float, following: NextRecording, small: ErrorUnit) -> str:
-    """The residual before and after, and what to expect of the next recording."""
+def errors(before: Residual, after: Residual, held: HoldOut | None, following: NextRecording, small: ErrorUnit) -> str:
+    """The errors before and after, what tells most first, and what to expect of
+    the next recording."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
     start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
-    return (
-        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; expanded uncertainty in "
-        f"the next recording {within} ({start} from start to start, {how})"
-    )
+    said = [] if held is None else [_pair("held-out rms", *map(small.in_full, (held.before_rms_g, held.after_rms_g)))]
+    pairs = ((r.cross_validated_rms_g, r.weighted_rms, r.reduced_chi2) for r in (before, after))
+    crossed, weighted, chi2 = zip(*pairs, strict=True)
+    if None not in crossed:
+        said.append(_pair("cross-validated rms", *map(small.in_full, crossed)))
+    if None not in weighted:
+        said.append(_pair("residuals of", *(f"{plain(v, 2)} standard errors rms" for v in weighted)))
+    if None not in chi2:
+        said.append(_pair("χ² per degree of freedom", *(plain(v, 2) for v in chi2)))
+    said.append(_pair("residual rms", small.in_full(before.rms_g), small.in_full(after.rms_g)))
+    said.append(f"expanded uncertainty in the next recording {within} ({start} from start to start, {how})")
+    return "; ".join(said)
+
+
+def _pair(what: str, before: str, after: str) -> str:
+    return f"{what} {before} before, {after} after"

@@ -11,9 +11,9 @@ from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
-from triaxcald.report.document import CANDIDATE, Finding, Outcome
+from triaxcald.report.document import CANDIDATE, EVEN, Finding, Outcome
 from triaxcald.report.faults import faults_of
-from triaxcald.report.figures import micro_g
+from triaxcald.report.figures import chance, effect_title, micro_g
 from triaxcald.report.meanings import told
 from triaxcald.report.untrusted import mapping
 
@@ -26,8 +26,10 @@ _WHAT_IS_LEFT = {
 }
 """Of a search for effects, and of a fit."""
 _MOST_NAMED = 3
-EVEN = 0.5
-"""Below this probability of nothing something acts, whatever that is."""
+INVESTIGATE = "investigate"
+_CALLS = {"usable": "Usable", "record_more": "Record more", INVESTIGATE: "Investigate"}
+"""What to do with the calibration, as documents have it."""
+_ANOTHER = "one calibration does not hold in all poses"
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,11 @@ def _judged(
     exceeded = [check.name for check in checks if check.passed is False]
     if exceeded:
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
-    if _unexplained(outcome):
+    if _unexplained(outcome) or outcome.another_unit:
         kept = "Every declared limit is kept, but " if checks and not open_checks and not failed else ""
-        headline, what = _UNEXPLAINED, f"{_WHAT_IS_LEFT[outcome.searched]}. {errors}"
+        left = _ANOTHER if outcome.another_unit else _WHAT_IS_LEFT[outcome.searched]
+        headline = _called(outcome, _ANOTHER[0].upper() + _ANOTHER[1:] if outcome.another_unit else _UNEXPLAINED)
+        what = f"{left}. {errors}"
         if _spoiled(outcome) or _rejected(outcome):
             headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
@@ -128,7 +132,7 @@ def _judged(
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
-    headline = _WITHIN if checks else _without_limits(outcome)
+    headline = _WITHIN if checks else _called(outcome, _without_limits(outcome))
     nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome) or _something(outcome)
     uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
@@ -136,11 +140,19 @@ def _judged(
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
 
 
+def _called(outcome: Outcome, headline: str) -> str:
+    """With what to do with the calibration, where the document says it."""
+    call = _CALLS.get(outcome.call)
+    return headline if call is None else f"{call}: {headline[:1].lower()}{headline[1:]}"
+
+
 def _without_limits(outcome: Outcome) -> str:
     if not outcome.searched:
         return "No lack of fit shows"
     if _could_find_nothing(outcome):
         return "No effect could show in full"
+    if not outcome.findings and outcome.averaged:
+        return "No effect certain, an average over what may act corrected"
     if not outcome.findings:
         sure = not _lacks_fit(outcome) and not _something(outcome)
         return "Nothing found beyond noise" if sure else "Nothing certain found beyond noise"
@@ -184,6 +196,9 @@ def _found(outcome: Outcome) -> str:
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
+    if not outcome.findings and outcome.averaged:
+        each = ", ".join(f"{effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items())
+        return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
     if not outcome.findings and _something(outcome):
         return "Something acts beyond the linear model, and these poses do not tell what. "
     if not outcome.findings:
