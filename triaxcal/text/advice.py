@@ -61,8 +61,7 @@ def _without_recording(loop: Loop) -> str:
 
 def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     """What to do, an action a line, the most urgent first."""
-    recordings = [*_poses_again(loop), *_apart(loop), *_next(loop, small)]
-    yield from recordings
+    yield from [*_poses_again(loop), *_apart(loop), *_next(loop, small)] or [_without_recording(loop)]
     if loop.held_out is not None and loop.held_out.worse:
         before, after = small.in_full(loop.held_out.before_rms_g), small.in_full(loop.held_out.after_rms_g)
         yield (
@@ -72,8 +71,6 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     for finding in loop.findings:
         if finding.verdict is Verdict.ADOPTED:
             yield f"{finding.effect}: {finding.remedy}"
-    if not recordings:
-        yield _without_recording(loop)
 
 
 def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:

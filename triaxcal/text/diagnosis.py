@@ -3,7 +3,7 @@ how likely, and what is left."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.estimate.calibration import Residual
@@ -36,17 +36,10 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     and what to do. ``following`` is the next recording where a station knows
     more of the reference than the poses tell."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
+    acts = cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities)
     return (
         call(loop.call),
-        "; ".join(
-            filter(
-                None,
-                (
-                    cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
-                    averaged(loop.averaged),
-                ),
-            )
-        ),
+        "; ".join(part for part in (acts, averaged(loop.averaged)) if part),
         errors(loop.before.residual, loop.after.residual, loop.held_out, following or loop.next_recording, small),
         to_do(loop, small),
     )
@@ -142,19 +135,25 @@ def errors(before: Residual, after: Residual, held: HoldOut | None, following: N
     the next recording."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
     start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
-    said = [] if held is None else [_pair("held-out rms", *map(small.in_full, (held.before_rms_g, held.after_rms_g)))]
-    pairs = ((r.cross_validated_rms_g, r.weighted_rms, r.reduced_chi2) for r in (before, after))
-    crossed, weighted, chi2 = zip(*pairs, strict=True)
-    if None not in crossed:
-        said.append(_pair("cross-validated rms", *map(small.in_full, crossed)))
-    if None not in weighted:
-        said.append(_pair("residuals of", *(f"{plain(v, 2)} standard errors rms" for v in weighted)))
-    if None not in chi2:
-        said.append(_pair("χ² per degree of freedom", *(plain(v, 2) for v in chi2)))
-    said.append(_pair("residual rms", small.in_full(before.rms_g), small.in_full(after.rms_g)))
+    said = []
+    if held is not None:
+        said.append(f"held-out rms {_pair(small.in_full, held.before_rms_g, held.after_rms_g)}")
+    if before.cross_validated_rms_g is not None and after.cross_validated_rms_g is not None:
+        crossed = _pair(small.in_full, before.cross_validated_rms_g, after.cross_validated_rms_g)
+        said.append(f"cross-validated rms {crossed}")
+    if before.weighted_rms is not None and after.weighted_rms is not None:
+        said.append(f"residuals in standard errors, rms, {_pair(_ratio, before.weighted_rms, after.weighted_rms)}")
+    if before.reduced_chi2 is not None and after.reduced_chi2 is not None:
+        said.append(f"χ² per degree of freedom {_pair(_ratio, before.reduced_chi2, after.reduced_chi2)}")
+    said.append(f"residual rms {_pair(small.in_full, before.rms_g, after.rms_g)}")
     said.append(f"expanded uncertainty in the next recording {within} ({start} from start to start, {how})")
     return "; ".join(said)
 
 
-def _pair(what: str, before: str, after: str) -> str:
-    return f"{what} {before} before, {after} after"
+def _pair(text: Callable[[float], str], before: float, after: float) -> str:
+    """Before and after; once where nothing is corrected."""
+    return text(before) if before == after else f"{text(before)} before, {text(after)} after"
+
+
+def _ratio(value: float) -> str:
+    return plain(value, 2)

@@ -34,7 +34,7 @@ def title(trace: Trace) -> str:
     on = f", axis {trace.axis}" if trace.axis else f", {', '.join(trace.coefficients)}" if trace.coefficients else ""
     if trace.effect:
         return effect_title(trace.effect) + on
-    return "Residual" if trace.quantity is Quantity.STANDARD_ERRORS else f"No known effect{on}"
+    return "Residual" if trace.quantity is Quantity.STANDARD_ERRORS else f"Unexplained, by {variable(trace)}"
 
 
 def variable(trace: Trace) -> str:

@@ -13,7 +13,7 @@ from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
 from triaxcald.report.document import CANDIDATE, EVEN, Finding, Outcome
 from triaxcald.report.faults import faults_of
-from triaxcald.report.figures import chance, effect_title, micro_g
+from triaxcald.report.figures import chance, effect_title, micro_g, ratio
 from triaxcald.report.meanings import told
 from triaxcald.report.untrusted import mapping
 
@@ -192,7 +192,8 @@ def _uncertain(outcome: Outcome) -> bool:
 
 def _found(outcome: Outcome) -> str:
     """The effects in words, each with its name."""
-    if not outcome.searched or not (outcome.findings or _tested(outcome)):
+    unexplained = outcome.unexplained is not None and outcome.unexplained.significant
+    if not outcome.searched or not (outcome.findings or _tested(outcome)) or (unexplained and not outcome.findings):
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
@@ -210,12 +211,14 @@ def _found(outcome: Outcome) -> str:
 
 
 def _named(finding: Finding, outcome: Outcome) -> str:
-    names = (finding.effect, *finding.alternatives)
+    names = {finding.effect: finding.probability, **{n: finding.probabilities.get(n) for n in finding.alternatives}}
     clauses = []
-    for name in names[:_MOST_NAMED]:
+    for name, probability in list(names.items())[:_MOST_NAMED]:
         known = told(name, outcome.channel_reference)
         title = known.title.lower()
-        clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
+        beside = [] if known.clause == title else [title]
+        beside += [] if probability is None else [f"probability {chance(probability)}"]
+        clauses.append(f"{known.clause} ({', '.join(beside)})" if beside else known.clause)
     clauses += ["others"] if len(names) > _MOST_NAMED else []
     doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
     return " or ".join(clauses) + doubt
@@ -265,7 +268,12 @@ def _errors(outcome: Outcome) -> str:
     text = f"Error of the magnitude, {name}: {micro_g(after, unit)} rms"
     if len(pairs) > 1 and pairs[0] is not None:
         text += f", {micro_g(pairs[0], unit)} before"
-    return f"{text}; noise floor {micro_g(floor_g, unit)}."
+    weighted = [s.residual.weighted_rms for s in outcome.stages]
+    in_errors = ""
+    if weighted and weighted[-1] is not None:
+        before = f", {ratio(weighted[0])} before" if len(weighted) > 1 else ""
+        in_errors = f"; residuals in standard errors: {ratio(weighted[-1])} rms{before}"
+    return f"{text}; noise floor {micro_g(floor_g, unit)}{in_errors}."
 
 
 def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: ErrorUnit) -> list[str]:
