@@ -18,7 +18,7 @@ from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_d
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
-__all__ = ["advice", "averaged", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]
+__all__ = ["advice", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]
 
 EVEN = 0.5
 """Probability from which on it is likelier than not that nothing acts."""
@@ -36,20 +36,18 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     and what to do. ``following`` is the next recording where a station knows
     more of the reference than the poses tell."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
-    acts = cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities)
+    acts = cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities, loop.averaged)
     return (
         call(loop.call),
-        "; ".join(part for part in (acts, averaged(loop.averaged)) if part),
+        acts,
         errors(loop.before.residual, loop.after.residual, loop.held_out, following or loop.next_recording, small),
         to_do(loop, small),
     )
 
 
 def averaged(weights: Mapping[str, float]) -> str:
-    """What the correction holds of effects that are neither found nor likely;
-    empty where it holds none."""
     each = ", ".join(f"{name} ({chance(p)})" for name, p in weights.items())
-    return f"the correction averages over what may act, each by its probability: {each}" if each else ""
+    return f"the correction averages over what may act, each by its probability: {each}"
 
 
 def call(found: Recommendation) -> str:
@@ -63,15 +61,20 @@ def cause(
     began: Mapping[int, PoseStart],
     small: ErrorUnit,
     probabilities: Mapping[str, float],
+    weights: Mapping[str, float] | None = None,
 ) -> str:
     """What acts, each with its probability; ``began`` says when the poses
     began, by their place. ``probabilities`` are those of all effects, the
-    likeliest first."""
-    said = [*_causes(found, findings, candidates, began, small)]
-    if said:
-        return "; ".join(said)
+    likeliest first, and ``weights`` those of effects that are corrected as far
+    as they are probable, and named nowhere else."""
+    said = [*_causes(found, findings, candidates, began, small)] or [_nothing_named(found, probabilities, weights)]
+    return "; ".join([*said, *([averaged(weights)] if weights else [])])
+
+
+def _nothing_named(found: Findings, probabilities: Mapping[str, float], weights: Mapping[str, float] | None) -> str:
     if found.nothing >= EVEN:
-        return f"no effect shows (nothing acts with probability {chance(found.nothing)})"
+        shows = "is likely" if weights else "shows"
+        return f"no effect {shows} (nothing acts with probability {chance(found.nothing)})"
     likely = [f"{name} ({chance(p)})" for name, p in probabilities.items()][:LIKELIEST]
     none = f"something that no effect describes ({chance(found.unexplained.probability)})"
     return f"something acts, and these poses do not tell what; the likeliest are {', '.join(likely)}; or {none}"

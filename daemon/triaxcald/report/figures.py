@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from triaxcal.rounding import MISSING as MISSING
-from triaxcal.rounding import concise, concise_error
+from triaxcal.rounding import NARROW, concise, concise_error
 from triaxcal.text import advice as text
 from triaxcal.text.traces import effect_title as effect_title
 from triaxcal.units import ErrorUnit
@@ -27,8 +27,8 @@ def number(value: object) -> float | None:
 def clean(value: object) -> str:
     """Text from data without characters that print as nothing or reorder their
     neighbours."""
-    text = "".join(c if c.isprintable() else " " if c.isspace() else "\ufffd" for c in str(value))
-    return " ".join(text.split())
+    shown = "".join(c if c.isprintable() or c == NARROW else " " if c.isspace() else "\ufffd" for c in str(value))
+    return " ".join(part for part in shown.split(" ") if part)
 
 
 def fixed(value: float | None, decimals: int) -> str:
@@ -103,8 +103,10 @@ def chance(p: float | None) -> str:
 
 
 def plus_minus(value: float | None, standard_error: float | None, unit: str) -> str:
-    """A coefficient to the place of its standard error."""
-    return concise(value, standard_error, unit_text(unit))
+    """A coefficient to the place of its standard error; one whose error is not
+    known says so."""
+    known = standard_error is not None and standard_error > 0
+    return concise(value, standard_error, unit_text(unit)) + ("" if known or value is None else f" ± {MISSING}")
 
 
 def expanded(value: float | None) -> str:
