@@ -33,6 +33,9 @@ from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
 
+SHOWN = 2
+"""Effects that are only corrected on average, at most, in `Loop.traces`: more
+would hide the likeliest."""
 Coefficients = Mapping[str, tuple[float, float | None, str]]
 """Name → value, standard error, unit."""
 
@@ -110,10 +113,12 @@ class Loop:
     @cached_property
     def traces(self) -> tuple[Trace, ...]:
         """What the poses show of each finding and each candidate, against what
-        drives it; of what has no name, against the variables that tell most of
-        it. Where no effect probably acts, the residuals."""
+        drives it; where there are none, of the likeliest effects that are
+        corrected all the same. Of what has no name, against the variables that
+        tell most of it. Where no effect probably acts, the residuals."""
         rows = self.posterior.evidence.rows
         names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
+        names = names or sorted(self.averaged, key=lambda name: -self.averaged[name])[:SHOWN]
         of_names = [of_effect(rows, self.conditional_on.get(name, self.after), name) for name in names]
         something = self.found.nothing < self.posterior.evidence.odds.reported
         untold = self.found.unexplained.significant or (something and not names and not self.found.outliers)

@@ -65,6 +65,7 @@ rounding, or by far more."""
 OF_READING, OF_COVARIATE = (3, 4, 5), (1, 2)
 """Degrees of the polynomials of `telling_variables`."""
 AXES = 3
+"""The sensitive axes, and the components of a vector."""
 
 
 class Quantity(StrEnum):

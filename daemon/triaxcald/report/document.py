@@ -181,11 +181,13 @@ class Outcome:
 
     @property
     def something_is_left(self) -> bool:
-        """Whether it is likelier than not that something acts, or more is left
-        than noise accounts for."""
+        """Whether it is likelier than not that something acts beside the outliers
+        that are excluded, or more is left than noise accounts for."""
         p, nothing = self.final.lack_of_fit_p, self.nothing_probability
         unexplained = self.unexplained is not None and self.unexplained.significant
-        return unexplained or (p is not None and p < LACK_OF_FIT) or (nothing is not None and nothing < EVEN)
+        outliers = any(pose.again for pose in self.poses)
+        something = nothing is not None and nothing < EVEN and not outliers
+        return unexplained or something or (p is not None and p < LACK_OF_FIT)
 
 
 def read_document(document: Mapping[str, object]) -> Outcome:

@@ -35,6 +35,8 @@ class Panel:
     title: str
     caption: str
     drawing: Markup
+    partial: bool
+    """Whether it is of partial residuals."""
 
 
 def trace_panels(value: object, outcome: Outcome, unit: ErrorUnit = MICRO_G) -> tuple[Panel, ...]:
@@ -112,7 +114,8 @@ def _panel(trace: Trace, outcome: Outcome, unit: ErrorUnit, name: str) -> Panel:
         hang_grid(axes)
 
     drawing = draw(name, words.description(trace, unit), PANEL_IN, paint)
-    return Panel(words.title(trace), _caption(trace, outcome), drawing)
+    partial = trace.quantity is not Quantity.STANDARD_ERRORS
+    return Panel(words.title(trace), _caption(trace, outcome), drawing, partial)
 
 
 def _caption(trace: Trace, outcome: Outcome) -> str:
@@ -122,7 +125,9 @@ def _caption(trace: Trace, outcome: Outcome) -> str:
     if trace.share is not None:
         return f"A smooth curve takes away {100 * max(trace.share, 0.0):.0f} % of the weighted residual (adjusted)"
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
-    return _of_finding(finding) if finding else ""
+    if finding is None:
+        return f"Probability {chance(outcome.averaged.get(trace.effect))}, and corrected by as much"
+    return _of_finding(finding)
 
 
 def _of_finding(finding: Finding) -> str:

@@ -11,7 +11,7 @@ from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
-from triaxcald.report.document import CANDIDATE, EVEN, Finding, Outcome
+from triaxcald.report.document import CANDIDATE, Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import chance, effect_title, micro_g, ratio
 from triaxcald.report.meanings import told
@@ -133,7 +133,7 @@ def _judged(
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
     headline = _WITHIN if checks else _called(outcome, _without_limits(outcome))
-    nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome) or _something(outcome)
+    nothing_sure = outcome.something_is_left or _could_find_nothing(outcome) or bool(outcome.averaged)
     uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
@@ -154,7 +154,7 @@ def _without_limits(outcome: Outcome) -> str:
     if not outcome.findings and outcome.averaged:
         return "No effect certain, an average over what may act corrected"
     if not outcome.findings:
-        sure = not _lacks_fit(outcome) and not _something(outcome)
+        sure = not outcome.something_is_left
         return "Nothing found beyond noise" if sure else "Nothing certain found beyond noise"
     return _effects(outcome)
 
@@ -170,11 +170,6 @@ def _effects(outcome: Outcome) -> str:
 
 def _could_find_nothing(outcome: Outcome) -> bool:
     return outcome.searched and not outcome.findings and none_could_show(outcome.blind_to)
-
-
-def _something(outcome: Outcome) -> bool:
-    """Whether it is likelier than not that something acts."""
-    return outcome.nothing_probability is not None and outcome.nothing_probability < EVEN
 
 
 def _spoiled(outcome: Outcome) -> bool:
@@ -200,7 +195,7 @@ def _found(outcome: Outcome) -> str:
     if not outcome.findings and outcome.averaged:
         each = ", ".join(f"{effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items())
         return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
-    if not outcome.findings and _something(outcome):
+    if not outcome.findings and outcome.something_is_left:
         return "Something acts beyond the linear model, and these poses do not tell what. "
     if not outcome.findings:
         return "No effect beyond the linear model was found. "
