@@ -189,8 +189,13 @@ class _Coefficients:
         squared = float(self.values @ np.linalg.pinv(self.covariance, hermitian=True) @ self.values)
         return float(1 / np.sqrt(max(squared, 1e-300)))
 
-    def only(self, index: Ints) -> _Coefficients:
-        return replace(self, values=self.values[index], covariance=self.covariance[np.ix_(index, index)])
+    def only(self, index: Ints, given: Ints | None = None) -> _Coefficients:
+        """Some of them, as they are known if those ``given`` are as estimated."""
+        covariance = self.covariance[np.ix_(index, index)]
+        if given is not None and len(given):
+            crossed, others = self.covariance[np.ix_(index, given)], self.covariance[np.ix_(given, given)]
+            covariance = covariance - crossed @ np.linalg.pinv(others, hermitian=True) @ crossed.T
+        return replace(self, values=self.values[index], covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,12 +292,13 @@ class _Data:
         contribution = self.contribution(self.rows.by_coefficients(effect))
         groups = _groups(effect)
         weight = [self.weight(contribution[:, index] @ q[index]) for index in groups]
+        whole = _Coefficients(q, covariance, coverage)
         for k in sorted(sorted(range(len(groups)), key=lambda k: -weight[k])[:PANELS]):
             if weight[k] > 0:
                 index = groups[k]
-                spread = _Coefficients(q[index], covariance[np.ix_(index, index)], coverage)
                 names = tuple(effect.coefficients[i].name for i in index)
-                made = self.trace(self.driver(effect, index), contribution[:, index], spread, self.residual)
+                own = whole.only(index, given=_of_other_recordings(effect, index))
+                made = self.trace(self.driver(effect, index), contribution[:, index], own, self.residual)
                 yield replace(made, effect=effect.name, coefficients=names)
 
     def contribution(self, columns: Floats) -> Floats:
@@ -534,6 +540,17 @@ def _groups(effect: Effect) -> list[Ints]:
     recordings."""
     keys = [(c.part, runs_named([c.name]) if RUN not in effect.needs[:1] else ()) for c in effect.coefficients]
     return [np.array([i for i, other in enumerate(keys) if other == key]) for key in dict.fromkeys(keys)]
+
+
+def _of_other_recordings(effect: Effect, index: Ints) -> Ints:
+    """The coefficients of the same part in other recordings. What these have in
+    common is also the unit's own bias, which no picture of one recording
+    shows: its band is that beside the others."""
+    part = effect.coefficients[index[0]].part
+    own = set(index.tolist())
+    runs = runs_named(effect.coefficients[i].name for i in index)
+    same = [i for i, c in enumerate(effect.coefficients) if runs and c.part == part and i not in own]
+    return np.array(same, dtype=int)
 
 
 def _driving(effect: Effect, axis: int) -> str | None:

@@ -45,9 +45,9 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     )
 
 
-def averaged(weights: Mapping[str, float]) -> str:
+def _each(weights: Mapping[str, float]) -> str:
     each = ", ".join(f"{name} ({chance(p)})" for name, p in weights.items())
-    return f"the correction averages over what may act, each by its probability: {each}"
+    return f"what may act, each by its probability: {each}"
 
 
 def call(found: Recommendation) -> str:
@@ -67,8 +67,10 @@ def cause(
     began, by their place. ``probabilities`` are those of all effects, the
     likeliest first, and ``weights`` those of effects that are corrected as far
     as they are probable, and named nowhere else."""
-    said = [*_causes(found, findings, candidates, began, small)] or [_nothing_named(found, probabilities, weights)]
-    return "; ".join([*said, *([averaged(weights)] if weights else [])])
+    said = [*_causes(found, findings, candidates, began, small)]
+    also = " also" if findings or candidates else ""
+    mean = [f"the correction{also} averages over {_each(weights)}"] if weights else []
+    return "; ".join([*(said or [_nothing_named(found, probabilities, weights)]), *mean])
 
 
 def _nothing_named(found: Findings, probabilities: Mapping[str, float], weights: Mapping[str, float] | None) -> str:

@@ -4,6 +4,7 @@ axes, and what it shows."""
 from __future__ import annotations
 
 from triaxcal.effects.contract import BEFORE, CHANGE, RUN, SCATTER, SINCE_START, TIME, channel_of, lag_in, rate_of
+from triaxcal.effects.in_run import runs_named
 from triaxcal.evidence.partial_residuals import POSE, PREDICTED, READINGS, Quantity, Trace, unit_of
 from triaxcal.units import ErrorUnit, in_units_of
 
@@ -32,6 +33,8 @@ def effect_title(effect: str) -> str:
 def title(trace: Trace) -> str:
     """What the panel is of."""
     on = f", axis {trace.axis}" if trace.axis else f", {', '.join(trace.coefficients)}" if trace.coefficients else ""
+    runs = runs_named(trace.coefficients) if trace.variable != RUN else ()
+    on += "".join(f", recording {run + 1}" for run in runs)
     if trace.effect:
         return effect_title(trace.effect) + on
     return "Residual" if trace.quantity is Quantity.STANDARD_ERRORS else f"Unexplained, by {variable(trace)}"

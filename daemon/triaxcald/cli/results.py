@@ -88,7 +88,7 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
             value, known, of = c.coefficients_of(effect.name)[name]
             rows.append([f"{effect.name}.{name}", concise(value, known, of), *(["—"] if whole else [])])
     expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
-    table("coefficients, the standard error of the last digits in brackets", ["", "value", *expanded_at], rows)
+    table("coefficients", ["", "value (standard error)", *expanded_at], rows)
     if held := holds_of(c):
         show(f"scale factor, misalignment and bias hold {'; '.join(held)}")
 

@@ -26,8 +26,8 @@ _WHAT_IS_LEFT = {
 }
 """Of a search for effects, and of a fit."""
 _MOST_NAMED = 3
-INVESTIGATE = "investigate"
-_CALLS = {"usable": "Usable", "record_more": "Record more", INVESTIGATE: "Investigate"}
+USABLE = "usable"
+_CALLS = {USABLE: "Usable", "record_more": "Record more", "investigate": "Investigate"}
 """What to do with the calibration, as documents have it."""
 _ANOTHER = "one calibration does not hold in all poses"
 
@@ -134,7 +134,8 @@ def _judged(
                        reservations, checks)  # fmt: skip
     headline = _WITHIN if checks else _called(outcome, _without_limits(outcome))
     nothing_sure = outcome.something_is_left or _could_find_nothing(outcome) or bool(outcome.averaged)
-    uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
+    more = outcome.call in _CALLS and outcome.call != USABLE
+    uncertain = not checks and (more or _uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
