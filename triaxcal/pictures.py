@@ -3,8 +3,10 @@ when it is called."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,16 +44,32 @@ class Inks:
     zero: str = "0.7"
 
 
+def _figure(size_in: tuple[float, float]) -> Figure:
+    """One that a notebook shows."""
+    return _shown_in_notebooks()(figsize=size_in, layout="constrained")
+
+
+@cache
+def _shown_in_notebooks() -> type[Figure]:
+    from matplotlib.figure import Figure  # not pyplot: no window, no state
+
+    class NotebookFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            sheet = io.BytesIO()
+            self.savefig(sheet, format="png")
+            return sheet.getvalue()
+
+    return NotebookFigure
+
+
 def traces_figure(traces: Sequence[Trace], small: ErrorUnit) -> Figure:
     """A panel for each, under its title. Raises InvalidData where there are
     none."""
-    from matplotlib.figure import Figure
-
     if not traces:
         raise InvalidData("there is no trace to plot")
     columns = min(COLUMNS, len(traces))
     rows = -(-len(traces) // columns)
-    figure = Figure(figsize=(PANEL_IN[0] * columns, PANEL_IN[1] * rows), layout="constrained")
+    figure = _figure((PANEL_IN[0] * columns, PANEL_IN[1] * rows))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, trace in zip(panels, traces, strict=False):
         paint_trace(axes, trace, small)
@@ -109,8 +127,6 @@ def residuals_figure(document: Mapping[str, Any]) -> Figure:
     with their standard errors, and where the poses lie on the sphere, in an
     equal-area projection of both halves. Raises InvalidData where it has no
     poses."""
-    from matplotlib.figure import Figure  # not pyplot: no window, no state
-
     poses = document.get("poses") or []
     if not poses:
         raise InvalidData("there is no pose to plot: this calibration is not of still poses")
@@ -123,7 +139,7 @@ def residuals_figure(document: Mapping[str, Any]) -> Figure:
         up = np.array([p["direction"] for p in poses], dtype=float).reshape(len(poses), 3)
     except (AttributeError, KeyError, TypeError, ValueError) as e:
         raise InvalidData(f"poses that cannot be plotted: {e!r}") from None
-    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    figure = _figure(SIZE_IN)
     left, right = figure.subplots(1, 2, width_ratios=[3, 2])
     number = np.arange(1, len(poses) + 1)
     left.axhline(0.0, color="0.7", linewidth=0.8)

@@ -329,6 +329,7 @@ def test_a_diagnosis_is_plotted_without_a_window(diagnosed: tc.Diagnosis, tmp_pa
         np.testing.assert_allclose(curve.get_ydata(), trace.curve * 1e6)
         assert axes.get_ylabel().endswith("µg")
     figure.savefig(tmp_path / "plot.png")
+    assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
 
 
 def test_a_diagnosis_has_what_acts_with_its_probability(diagnosed: tc.Diagnosis) -> None:
