@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from triaxcal import text as of_metrology
 from triaxcal.evidence.prior import Odds
 from triaxcal.number_format import number_of
-from triaxcal.rounding import number
+from triaxcal.rounding import concise, number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
 from triaxcal_drivers.extras import absent
@@ -101,8 +101,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     loop, v = o.certified.loop, o.verification
     b, f = loop.before.residual, loop.after.residual
     rows: list[Sequence[Any]] = [
-        ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
         ["fit: cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g), ""],
+        ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
     ]
     if v:
         rows.append(
@@ -124,8 +124,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     for effect in likely:
         show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(loop.after.weights[effect.name])})")
         for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
-            told = unit if error is None else f"± {error:.1g} {unit}"
-            show(f"    {name} {value:+.4g} {told}")
+            show(f"    {name} {concise(value, error, unit)}")
     if o.provisioned:
         show(f"  {text.provisioned(o.provisioned)}")
     if o.settling and o.error is None:
