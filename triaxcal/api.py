@@ -291,10 +291,10 @@ def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | 
     recording: scale factors, misalignments and effects are kept.
 
     ``poses`` from `find_poses`, or what that takes; of them the ``first`` so
-    many distinct ones, or all. The uncertainty is that of today: what the
-    calibration says of itself, what changes from recording to recording, and
-    the poses. Raises Refused where these do not determine three biases, or
-    where what is kept no longer fits; InvalidData.
+    many that are 45° apart (10° where there are fewer), or all. The uncertainty
+    is that of today: what the calibration says of itself, what changes from
+    recording to recording, and the poses. Raises Refused where these do not
+    determine three biases, or where what is kept no longer fits; InvalidData.
     """
     if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
         raise InvalidData(f"first: expected a whole number of at least 1, not {first!r}")

@@ -17,8 +17,11 @@ DILUTION_LIMIT = 5.0
 times as uncertain as a pose, and with scale factors that change by 200 ppm,
 which a pose shows like noise, half as uncertain as without any pose."""
 APART_DEG = 10.0
-"""Poses nearer to each other tell hardly more than one of them. As far apart as
-a station wants its poses by default."""
+"""Poses nearer to each other count as one: as far apart as a station wants its
+poses by default."""
+FAR_APART_DEG = 45.0
+"""Of two poses nearer to each other more than half of what one tells of the
+biases (the square of the cosine) the other tells as well."""
 SCALE_FACTOR, ANGLE, BIAS = 2.0, 0.3, 20.0
 """By how much the parameters may be off before the poses are seen, in errors of
 a pose: of 100 µg, where scale factors change by 200 ppm and biases by 2 mg from
@@ -75,12 +78,15 @@ def distinct_directions(up: Floats) -> int:
 
 
 def first_distinct(up: Floats, count: int) -> list[int]:
-    """Rows of the first ``count`` directions (n,3) that differ from all before
-    them."""
-    kept: list[int] = []
-    for i, v in enumerate(up):
-        if len(kept) < count and all(float(v @ up[k]) < np.cos(np.radians(APART_DEG)) for k in kept):
-            kept.append(i)
+    """Rows of the first ``count`` directions (n,3) that are `FAR_APART_DEG`
+    from all before them; where there are not so many, `APART_DEG`."""
+    for apart_deg in (FAR_APART_DEG, APART_DEG):
+        kept: list[int] = []
+        for i, v in enumerate(up):
+            if len(kept) < count and all(float(v @ up[k]) < np.cos(np.radians(apart_deg)) for k in kept):
+                kept.append(i)
+        if len(kept) == count:
+            break
     return kept
 
 

@@ -13,7 +13,8 @@ import pytest
 
 from tests.virtual_line import described, virtual_line
 from triaxcal.model.bias_directions import bias_directions
-from triaxcald.audit import Result, audit
+from triaxcald.audit import audit
+from triaxcald.audit.conduct import Result
 from triaxcald.earlier import ATTACHMENT
 from triaxcald.recording.reader import Recording
 

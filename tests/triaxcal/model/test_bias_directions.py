@@ -74,3 +74,11 @@ def test_the_first_distinct_ones_are_found_in_order() -> None:
     ups = np.array([CUBE[0], near / np.linalg.norm(near), CUBE[1], CUBE[0], CUBE[2], CUBE[3]])
     assert first_distinct(ups, 3) == [0, 2, 4]
     assert first_distinct(ups, 9) == [0, 2, 4, 5]
+
+
+def test_poses_far_apart_come_first_and_nearer_ones_where_there_are_no_others() -> None:
+    leaning = np.array([1.0, 0.4, 0.0]) / np.hypot(1.0, 0.4)  # 22° off
+    ups = np.array([CUBE[0], leaning, CUBE[1], CUBE[2]])
+    assert first_distinct(ups, 3) == [0, 2, 3]
+    assert first_distinct(ups, 4) == [0, 1, 2, 3]
+    assert first_distinct(CUBE, 26) == list(range(26))
