@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.documents import Calibration, earlier_of
+from triaxcal.effects.contract import channel_of, is_derived
 from triaxcal.errors import Refused
-from triaxcal.inputs.bias_update import Earlier
+from triaxcal.inputs.bias_update import Earlier, require_known
 from triaxcal.units import same_unit
 from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.profile import READINGS
 from triaxcald.errors import InputError
 from triaxcald.inputs import DOCUMENT_MOST, parse_document
 from triaxcald.provision.identity import same_serial
@@ -92,7 +94,10 @@ class EarlierFile:
             raise Refused(f"{self.name}: is of outputs in {c.output_unit}, and those of {what} are in {output_unit}")
 
     def require_of_place(self, place: Place, reference: float, serial: str | None) -> None:
-        """The same of a unit of a station, whose ``reference`` is in g."""
+        """The same of a unit of a station, whose ``reference`` is in g; and
+        where it does not say how uncertain it is, or needs a channel that the
+        unit does not send."""
+        require_known(self.known())
         self.require_of(
             f"unit {place.unit.name}",
             serial=serial,
@@ -101,6 +106,10 @@ class EarlierFile:
             reference_unit="g",
             output_unit=place.bundle.profile.output.unit,
         )
+        sent = getattr(place.bundle.profile.streams[READINGS], "channels", None)
+        needed = [channel_of(n) for n in self.calibration.fitted.channel_reference if not is_derived(n)]
+        if sent is not None and (missing := [name for name in needed if name not in sent]):
+            raise Refused(f"{self.name}: needs {', '.join(missing)}, which unit {place.unit.name} does not send")
 
 
 def earlier_by_unit(paths: Sequence[str], station: Station) -> dict[str, EarlierFile]:

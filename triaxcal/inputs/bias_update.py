@@ -20,6 +20,7 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.distributions import chi2_sf
+from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME
 from triaxcal.errors import NotStill, Refused
 from triaxcal.estimate.calibration import (
@@ -77,8 +78,9 @@ class Earlier:
     that every pose of it had beside its noise, ``noise_g`` what stands for the
     noise of a pose that does not know its own, ``start_to_start`` the standard
     deviation of |a| from recording to recording, None where nobody said;
-    ``measured``, or assumed. ``temperature_c`` is the temperature of its poses,
-    None where that is not known. The ``linear_only`` one is updated too.
+    ``measured``, or assumed. ``temperatures_c`` are the lowest and the highest
+    temperature of its poses, None where they are not known. The ``linear_only``
+    one is updated too.
     """
 
     calibration: Calibration
@@ -87,7 +89,7 @@ class Earlier:
     noise_g: float = float("nan")
     start_to_start: float | None = None
     measured: bool = False
-    temperature_c: float | None = None
+    temperatures_c: tuple[float, float] | None = None
     origin: Origin = field(default_factory=Origin)
     linear_only: Earlier | None = None
 
@@ -111,7 +113,7 @@ def updated_biases(poses: Sequence[Pose], earlier: Earlier, *, first: int | None
     is kept; InvalidData where a channel that the effects need is missing.
     """
     c = earlier.calibration
-    _require_known(earlier)
+    require_known(earlier)
     sound = [p for p in poses if not p.fault]
     _require_changes(sound)
     used = _chosen(sound, c, first)
@@ -127,7 +129,9 @@ def updated_biases(poses: Sequence[Pose], earlier: Earlier, *, first: int | None
     return replace(found, linear_only=linear_only)
 
 
-def _require_known(earlier: Earlier) -> None:
+def require_known(earlier: Earlier) -> None:
+    """Raises Refused where a calibration does not say how well its parameters
+    are known."""
     if not np.isfinite(earlier.covariance).all():
         raise Refused("the calibration does not say how uncertain its parameters are, so that nothing can be kept")
 
@@ -229,8 +233,8 @@ class _Update:
         """By how much biases, and scale factors relatively, change from one
         recording to another.
 
-        A calibration without thermal effects holds at the temperature of its
-        poses: elsewhere all changes by what a kelvin usually makes.
+        A calibration without thermal effects holds at the temperatures of its
+        poses: beyond them all changes by what a kelvin usually makes.
         """
         g, kelvin = self.earlier.calibration.reference, self._kelvin_away()
         bias = np.hypot(start_to_start, SENSITIVITY_PER_K["temperature_bias"] * kelvin * g)
@@ -244,11 +248,13 @@ class _Update:
         return np.diag(q**2)
 
     def _kelvin_away(self) -> float:
-        then = self.earlier.temperature_c
-        now = [p.channels.get("temp_c", np.nan) for p in self.poses]
-        modelled = any("temp_c" in effect.needs for effect, _ in self.earlier.calibration.sensor.effects)
-        away = 0.0 if then is None or modelled else float(np.mean(now)) - then
-        return abs(away) if np.isfinite(away) else 0.0
+        """How far the poses are from the temperatures of the earlier ones, in
+        the mean; 0 where thermal effects are modelled, or nothing is logged."""
+        then = self.earlier.temperatures_c
+        now = np.array([p.channels.get(TEMPERATURE, np.nan) for p in self.poses])
+        modelled = any(TEMPERATURE in effect.needs for effect, _ in self.earlier.calibration.sensor.effects)
+        away = 0.0 if then is None or modelled else float(np.mean(np.abs(now - np.clip(now, *then))))
+        return away if np.isfinite(away) else 0.0
 
     def _by_poses_alone(self, relative: float) -> _ByPosesAlone:
         kept = self.earlier.covariance + self._since(0.0, relative)

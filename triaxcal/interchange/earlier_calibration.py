@@ -34,7 +34,7 @@ def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Ea
     told = following if isinstance(following, Mapping) else {}
     start_to_start = number_in(told.get("start_to_start_g"))
     blind_to, alone = part.get("blind_to"), part.get("linear_only")
-    channels = logged_in(part, where=where)
+    warm = logged_in(part, where=where).get(TEMPERATURE)
     scatter, noise = _scatter(part)
     return Earlier(
         replace(fitted, blind_to=tuple(map(str, blind_to)) if isinstance(blind_to, list) else ()),
@@ -43,7 +43,7 @@ def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Ea
         noise_g=noise,
         start_to_start=start_to_start if start_to_start >= 0 else None,
         measured=told.get("source") == Source.MEASURED.value,
-        temperature_c=float(np.mean(channels[TEMPERATURE])) if TEMPERATURE in channels else None,
+        temperatures_c=None if warm is None else (float(warm.min()), float(warm.max())),
         origin=origin,
         linear_only=earlier_in(alone, origin, where=f"{where}: linear_only") if isinstance(alone, Mapping) else None,
     )

@@ -89,6 +89,7 @@ def test_the_console_shows_the_biases_and_the_error_before_and_after(
         assert word in done.out
 
 
+@pytest.mark.slow
 def test_a_page_is_made_of_it(workshop: Any, triaxcal: Run, earlier: Path) -> None:
     page = Path(workshop.folder) / "page.html"
     rec = means(workshop, TODAY, FOUR)

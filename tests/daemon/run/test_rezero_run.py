@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.conftest import Workshop
 from tests.virtual_line import described, virtual_line
 from triaxcal.model.bias_directions import bias_directions
 from triaxcald.audit import audit
 from triaxcald.audit.conduct import Result
+from triaxcald.cli.commands import main
 from triaxcald.earlier import ATTACHMENT
 from triaxcald.recording.reader import Recording
+from triaxcald.station.guidance import guide
 
 Run = Callable[..., Any]
 K = (-2.410618, -2.403823, -2.371761)
@@ -32,6 +37,9 @@ CAL = {
     "bias": BIAS.tolist(),
     "effects": {},
     "standard_error": {"scale_factor": [1e-4] * 3, "misalignment": [5e-5] * 3, "bias": [5e-5] * 3},
+}
+HUMID = {
+    "channel_bias:humidity": {axis: {"value": 1e-5, "standard_error": 1e-6, "unit": "g/[humidity]"} for axis in "xyz"}
 }
 NOBODY = {"host": "127.0.0.1", "port": 1}
 
@@ -54,31 +62,28 @@ class Days:
 @pytest.fixture(scope="module")
 def days(tmp_path_factory: pytest.TempPathFactory) -> Days:
     """A unit that is calibrated in full, and by four poses after its biases have moved."""
-    import contextlib
-    import io
-
-    from tests.conftest import Workshop
-    from triaxcald.cli.commands import main
-
     workshop = Workshop(tmp_path_factory.mktemp("days"))
-
-    def run(bias: np.ndarray, seed: int, *options: str) -> dict[str, Any]:
-        sensor = {"scale_factor": list(K), "bias": bias.tolist()}
-        device = workshop.device("left.toml", bus=BUS, sensor=sensor, fixture=FIXTURE, seed=seed)
-        station = workshop.station(unit(), plan=PLAN, limits={"rms_g": 2e-4, "verification_rms_g": 2e-4})
-        out, err = io.StringIO(), io.StringIO()
-        with virtual_line(described(device)), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            code = main(["run", str(station), "--json", *options])
-        assert code == 0, (out.getvalue(), err.getvalue())
-        found: dict[str, Any] = json.loads(out.getvalue())["units"][0]
-        return found
-
-    first = run(BIAS, 3)
+    first = ran(workshop, BIAS, 3)
+    assert first["exit_code"] == 0
     certificate = workshop.folder / "yesterday.json"
     certificate.write_bytes(Path(first["certificate"]).read_bytes())
     for path in workshop.folder.glob("left-4711-*"):  # the clock of the virtual line begins anew
         path.unlink()
-    return Days(workshop.folder, certificate, run(BIAS + SHIFT, 9, "--rezero", str(certificate)))
+    second = ran(workshop, BIAS + SHIFT, 9, "--rezero", str(certificate))
+    assert second["exit_code"] == 0
+    return Days(workshop.folder, certificate, second)
+
+
+def ran(workshop: Any, bias: np.ndarray, seed: int, *options: str, scale: float = 1.0) -> dict[str, Any]:
+    """The unit's part of what `run` says of it."""
+    sensor = {"scale_factor": [k * scale for k in K], "bias": bias.tolist()}
+    device = workshop.device("left.toml", bus=BUS, sensor=sensor, fixture=FIXTURE, seed=seed)
+    station = workshop.station(unit(), plan=PLAN, limits={"rms_g": 2e-4, "verification_rms_g": 2e-4})
+    out, err = io.StringIO(), io.StringIO()
+    with virtual_line(described(device)), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        main(["run", str(station), "--json", *options])
+    found: dict[str, Any] = json.loads(out.getvalue())["units"][0]
+    return found
 
 
 @pytest.mark.slow
@@ -128,6 +133,16 @@ def test_an_audit_with_another_calibration_differs(days: Days, rewrite: Callable
 
 
 @pytest.mark.slow
+def test_a_unit_whose_scale_factors_have_changed_is_refused_and_nothing_is_written(days: Days, workshop: Any) -> None:
+    found = ran(workshop, BIAS + SHIFT, 11, "--rezero", str(days.certificate), scale=1.01)
+    assert found["exit_code"] == 3
+    assert "no longer fit" in found["error"]
+    outcome = found["outcome"]
+    assert (outcome["verdict"], outcome["code"], outcome["device_state"]) == ("aborted", "refused", "untouched")
+    assert audit(Path(found["recording"])).differences == ()
+
+
+@pytest.mark.slow
 def test_its_certificate_can_be_renewed_the_day_after(days: Days, triaxcal: Run) -> None:
     certificate = days.second["certificate"]
     done = triaxcal("rezero", certificate, days.recording, "--json")
@@ -143,6 +158,7 @@ def test_its_certificate_can_be_renewed_the_day_after(days: Days, triaxcal: Run)
         ({"reference": 1.001}, "was made for the reference 1.001"),
         ({"reference": 9.80665, "units": {"reference": "m/s^2"}}, "was made for the reference 9.80665"),
         ({"units": {"output": "mV", "reference": "g"}}, "is of outputs in mV"),
+        ({"effects": HUMID, "channel_reference": {"humidity": 40.0}}, "needs humidity, which unit left does not send"),
     ],
 )
 def test_another_unit_and_other_signs_and_references_are_refused_before_anything_is_opened(
@@ -153,6 +169,11 @@ def test_another_unit_and_other_signs_and_references_are_refused_before_anything
     before = sorted(p.name for p in workshop.folder.iterdir())
     triaxcal("run", station, "--rezero", cal).failed(3, "refused: cal.json: ", words)
     assert sorted(p.name for p in workshop.folder.iterdir()) == before
+
+
+def test_a_calibration_that_does_not_say_how_uncertain_it_is_is_refused_at_once(workshop: Any, triaxcal: Run) -> None:
+    cal = workshop.write("cal.json", json.dumps({n: v for n, v in CAL.items() if n != "standard_error"}))
+    triaxcal("run", workshop.station(unit(bus=NOBODY)), "--rezero", cal).failed(3, "how uncertain")
 
 
 def test_a_unit_whose_serial_only_the_device_tells_is_refused_before_the_first_pose(
@@ -188,8 +209,6 @@ def test_a_plan_of_fewer_than_three_is_bad_input(workshop: Any, triaxcal: Run, v
 
 
 def test_the_operator_is_asked_for_the_directions_that_determine_the_biases() -> None:
-    from triaxcald.station.guidance import guide
-
     targets = bias_directions(4)
     state = guide([], wanted=4, hold_s=1.0, apart_deg=10.0, now_s=0.0, nominal_scale_factor=(1, 1, 1), targets=targets)
     assert state.missing == tuple(label for label, _ in targets)
