@@ -193,8 +193,9 @@ class BiasUpdate:
     poses under the earlier one, ``shift`` (3,) what the biases moved by,
     ``shift_error`` (3,) the standard deviations by which they were expected to.
     ``scatter_g`` is a standard deviation of |a| that every pose of the unit has
-    beside its noise; ``start_to_start`` that from one recording to another,
-    ``measured`` or assumed. All in the unit of the reference.
+    beside its noise, known by ``scatter_dof`` degrees of freedom;
+    ``start_to_start`` that from one recording to another, ``measured`` or
+    assumed. All in the unit of the reference.
     """
 
     earlier: Origin
@@ -204,6 +205,7 @@ class BiasUpdate:
     shift: Floats
     shift_error: Floats
     scatter_g: float
+    scatter_dof: float
     start_to_start: float
     measured: bool
 

@@ -18,16 +18,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from triaxcal.arrays import Bools, Floats
-from triaxcal.distributions import chi2_sf
+from triaxcal.arrays import Bools, Floats, rms
+from triaxcal.distributions import DOF_MOST, chi2_sf
 from triaxcal.effects import TEMPERATURE
-from triaxcal.effects.contract import DURATION, SINCE_START, TIME
+from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.errors import NotStill, Refused
 from triaxcal.estimate.calibration import (
     BiasUpdate,
     Calibration,
     HoldsAt,
     Origin,
+    PoseResult,
     Residual,
     pose_results,
     studentized,
@@ -78,14 +79,16 @@ class Earlier:
     that every pose of it had beside its noise, ``noise_g`` what stands for the
     noise of a pose that does not know its own, ``start_to_start`` the standard
     deviation of |a| from recording to recording, None where nobody said;
-    ``measured``, or assumed. ``temperatures_c`` are the lowest and the highest
-    temperature of its poses, None where they are not known. The ``linear_only``
-    one is updated too.
+    ``measured``, or assumed. ``residual_dof`` are the degrees of freedom of the
+    residuals that told the scatter, 0 where none did. ``temperatures_c`` are
+    the lowest and the highest temperature of its poses, None where they are not
+    known. The ``linear_only`` one is updated too.
     """
 
     calibration: Calibration
     covariance: Floats
     scatter_g: float = 0.0
+    residual_dof: float = 0.0
     noise_g: float = float("nan")
     start_to_start: float | None = None
     measured: bool = False
@@ -112,14 +115,18 @@ def updated_biases(poses: Sequence[Pose], earlier: Earlier, *, first: int | None
     Raises Refused where the poses cannot carry three biases, or do not fit what
     is kept; InvalidData where a channel that the effects need is missing.
     """
-    c = earlier.calibration
     require_known(earlier)
     sound = [p for p in poses if not p.fault]
     _require_changes(sound)
-    used = _chosen(sound, c, first)
-    used = with_unexplained_creep(used, c, elsewhere=True)
-    update = _Update(used, earlier)
-    found = update.calibration(poses)
+    try:
+        with np.errstate(all="ignore"):  # numbers out of a file may be any
+            chosen = _chosen(sound, earlier.calibration, first)
+            used = with_unexplained_creep(chosen, earlier.calibration, elsewhere=True)
+            found = _Update(used, earlier).calibration(poses)
+    except np.linalg.LinAlgError:
+        raise NotStill("the biases ran away") from None
+    if not np.isfinite(found.covariance).all():
+        raise NotStill("the biases ran away")
     if earlier.linear_only is None:
         return found
     try:
@@ -179,12 +186,15 @@ def _chosen(poses: Sequence[Pose], c: Calibration, first: int | None) -> list[Po
 @dataclass(frozen=True)
 class _ByPosesAlone:
     """The ``shift`` (3,) of the biases by generalised least squares, without
-    what is known of it before, its covariance ``variance`` (3,3), and the sum
-    of squares that it leaves."""
+    what is known of it before, and its covariance ``variance`` (3,3); what it
+    leaves of |a| in the poses, ``miss`` (n,), as a sum of squares ``chi2`` in
+    units of the errors that are known by ``dof`` degrees of freedom."""
 
     shift: Floats
     variance: Floats
+    miss: Floats
     chi2: float
+    dof: float
 
 
 class _Update:
@@ -193,72 +203,73 @@ class _Update:
     from recording to recording. A pose observes 0 = |a|(p₀ + d) − g + e."""
 
     def __init__(self, poses: Sequence[Pose], earlier: Earlier) -> None:
-        c = earlier.calibration
-        self.poses, self.earlier = poses, earlier
-        self.u = np.array([p.mean for p in poses])
-        self.covariates = _covariates(poses, c)
-        noise_covariance = np.array([p.covariance for p in poses])
+        self.poses, self.earlier, self.c = poses, earlier, earlier.calibration
+        self.u, self.covariates = np.array([p.mean for p in poses]), _covariates(poses, self.c)
+        self.noise = self._noise()
         # R: the noise of each pose along the measured vector, and what the
         # residuals of the earlier calibration showed beside noise.
-        _, by_u = c.sensor.magnitude(self.u, self.covariates)
-        self.noise = np.sqrt(np.einsum("ni,nij,nj->n", by_u, noise_covariance, by_u))
-        unknown = np.array([p.dof <= 0 for p in poses])
-        if unknown.any() and not np.isfinite(earlier.noise_g):
-            raise Refused("neither these poses nor the calibration say how large the noise of a pose is")
-        self.noise = np.where(unknown, earlier.noise_g, self.noise)
         self.variance = self.noise**2 + earlier.scatter_g**2
         self.pure_dof = within_pose_dof(poses)
-        self.begin_miss = self._miss(c.sensor.bias)
-        known = START_TO_START * c.reference if earlier.start_to_start is None else earlier.start_to_start
-        self.start_to_start = known
-        bias, relative = self._changes(known)
+        stated = earlier.start_to_start
+        self.start_to_start = START_TO_START * self.c.reference if stated is None else stated
+        self.expected, relative = self._changes()
         self.alone = self._by_poses_alone(relative)
         # How far the biases went tells too: a unit that moved by more than was
         # expected is not pulled back by the expectation.
         went = self.alone.shift @ self.alone.shift - np.trace(self.alone.variance)
-        self.since = self._since(max(bias, float(np.sqrt(max(went, 0.0) / 3))), relative)
+        self.since = self._since(max(self.expected, float(np.sqrt(max(went, 0.0) / 3))), relative)
+
+    def _noise(self) -> Floats:
+        """(n,) standard errors of |a|."""
+        covariance = np.array([p.covariance for p in self.poses])
+        _, by_u = self.c.sensor.magnitude(self.u, self.covariates)
+        unknown = np.array([p.dof <= 0 for p in self.poses])
+        if unknown.any() and not np.isfinite(self.earlier.noise_g):
+            raise Refused("neither these poses nor the calibration say how large the noise of a pose is")
+        return np.where(unknown, self.earlier.noise_g, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u)))
 
     def _miss(self, bias: Floats) -> Floats:
-        sensor = replace(self.earlier.calibration.sensor, bias=bias)
-        miss = sensor.magnitude(self.u, self.covariates)[0] - self.earlier.calibration.reference
+        """(n,) |a| less the reference."""
+        miss = replace(self.c.sensor, bias=bias).magnitude(self.u, self.covariates)[0] - self.c.reference
         if not np.isfinite(miss).all():
             raise NotStill("the biases ran away")
         return miss
 
     def _jacobian(self, bias: Floats) -> Floats:
-        sensor = replace(self.earlier.calibration.sensor, bias=bias)
-        return sensor.radius_by_parameters(self.u, self.covariates)
+        """(n,9+p) derivatives of |a| by the parameters."""
+        return replace(self.c.sensor, bias=bias).radius_by_parameters(self.u, self.covariates)
 
-    def _changes(self, start_to_start: float) -> tuple[float, float]:
+    def _changes(self) -> tuple[float, float]:
         """By how much biases, and scale factors relatively, change from one
         recording to another.
 
         A calibration without thermal effects holds at the temperatures of its
         poses: beyond them all changes by what a kelvin usually makes.
         """
-        g, kelvin = self.earlier.calibration.reference, self._kelvin_away()
-        bias = np.hypot(start_to_start, SENSITIVITY_PER_K["temperature_bias"] * kelvin * g)
-        relative = SCALE_FACTOR_SHARE * start_to_start / g
+        g, kelvin = self.c.reference, self._kelvin_away()
+        bias = np.hypot(self.start_to_start, SENSITIVITY_PER_K["temperature_bias"] * kelvin * g)
+        relative = SCALE_FACTOR_SHARE * self.start_to_start / g
         return float(bias), float(np.hypot(relative, SENSITIVITY_PER_K["temperature_scale_factor"] * kelvin))
-
-    def _since(self, bias: float, relative: float) -> Floats:
-        """Q (9+p,9+p)."""
-        q = np.zeros(len(self.earlier.covariance))
-        q[:3], q[6:9] = self.earlier.calibration.sensor.scale_factor * relative, bias
-        return np.diag(q**2)
 
     def _kelvin_away(self) -> float:
         """How far the poses are from the temperatures of the earlier ones, in
         the mean; 0 where thermal effects are modelled, or nothing is logged."""
         then = self.earlier.temperatures_c
         now = np.array([p.channels.get(TEMPERATURE, np.nan) for p in self.poses])
-        modelled = any(TEMPERATURE in effect.needs for effect, _ in self.earlier.calibration.sensor.effects)
+        modelled = any(TEMPERATURE in effect.needs for effect, _ in self.c.sensor.effects)
         away = 0.0 if then is None or modelled else float(np.mean(np.abs(now - np.clip(now, *then))))
         return away if np.isfinite(away) else 0.0
 
+    def _since(self, bias: float, relative: float) -> Floats:
+        """Q (9+p,9+p)."""
+        q = np.zeros(len(self.earlier.covariance))
+        q[:3], q[6:9] = self.c.sensor.scale_factor * relative, bias
+        return np.diag(q**2)
+
     def _by_poses_alone(self, relative: float) -> _ByPosesAlone:
+        begin = bias = self.c.sensor.bias
+        # |a| is off by what is kept too, but for the biases.
         kept = self.earlier.covariance + self._since(0.0, relative)
-        begin = bias = self.earlier.calibration.sensor.bias
         J = np.where(_is_bias(len(kept)), 0.0, self._jacobian(begin))
         inverse = np.linalg.inv(np.diag(self.variance) + J @ kept @ J.T)
         for _ in range(STEPS_MOST):
@@ -266,91 +277,26 @@ class _Update:
             variance = np.linalg.inv(J.T @ inverse @ J)
             step = -variance @ J.T @ inverse @ self._miss(bias)
             bias = bias + step
-            if np.max(np.abs(step)) <= CONVERGED * self.earlier.calibration.reference:
+            if np.max(np.abs(step)) <= CONVERGED * self.c.reference:
                 break
-        left = self._miss(bias)
-        return _ByPosesAlone(bias - begin, variance, float(left @ inverse @ left))
-
-    def calibration(self, all_poses: Sequence[Pose]) -> Calibration:
-        c, n = self.earlier.calibration, len(self.poses)
-        p, raised = self._fits()
-        prior = self.earlier.covariance + self.since
-        begin = bias = c.sensor.bias
-        for _ in range(STEPS_MOST):
-            J = self._jacobian(bias)
-            gain = prior @ J.T @ np.linalg.inv(J @ prior @ J.T + np.diag(self.variance))
-            moved = begin + gain[6:9] @ (J[:, 6:9] @ (bias - begin) - self._miss(bias))
-            step, bias = moved - bias, moved
-            if np.max(np.abs(step)) <= CONVERGED * c.reference:
-                break
-        shift = bias - begin
-        if not np.max(np.abs(shift)) < UNLIKE * c.reference:
-            share = plain(float(np.max(np.abs(shift))) / c.reference, 2)
-            raise Refused(
-                f"a bias would move by {share} of the reference: is it another unit, or are signs, order or unit of "
-                "its outputs others?"
-            )
-        # Kept parameters are not moved: their rows of the gain are zero. The
-        # errors of all that results, by their source (Joseph's form).
-        gain = np.where(_is_bias(len(gain))[:, None], gain, 0.0)
-        rest = np.eye(len(gain)) - gain @ J
-        covariances = {
-            "noise": (gain * self.noise**2) @ gain.T,
-            "scatter": gain @ gain.T * self.earlier.scatter_g**2,
-            "lack_of_fit": (gain * self.variance) @ gain.T * (raised**2 - 1),
-            "kept": rest @ self.earlier.covariance @ rest.T,
-            "since": rest @ self.since @ rest.T,
-        }
-        covariances = {name: v for name, v in covariances.items() if np.any(v)}
-        covariance = sum(covariances.values(), start=np.zeros_like(prior))
-        sensor = replace(c.sensor, bias=bias)
-        miss = self._miss(bias)
-        leverage = np.clip(np.einsum("np,pn->n", J, gain), 0.0, 1.0)
-        error = np.sqrt(self.variance) * raised
-        up = sensor.up(self.u, self.covariates)
-        expected = np.sqrt(np.diag(prior)[6:9])
-        update = BiasUpdate(
-            earlier=self.earlier.origin,
-            covariances=covariances,
-            before=Residual.of(self.begin_miss, self.noise),
-            before_residual_g=self.begin_miss,
-            shift=shift,
-            shift_error=expected,
-            scatter_g=self.earlier.scatter_g,
-            start_to_start=self.start_to_start,
-            measured=self.earlier.measured,
-        )
-        alone = miss / np.maximum(1 - leverage, 1e-9)
-        crossed = float(np.sqrt(np.mean(alone**2))) if np.all(leverage < 1 - 1e-6) else None
-        directions = J[:, 6:9] / np.linalg.norm(J[:, 6:9], axis=1, keepdims=True)
-        results = pose_results(
-            self.poses, up, miss, self.noise, studentized(miss, error, leverage), leverage, total=error
-        )
-        return Calibration(
-            sensor=sensor,
-            covariance=covariance,
-            reference=c.reference,
-            channel_reference=dict(c.channel_reference),
-            residual=Residual.of(miss, self.noise, cross_validated_rms_g=crossed, lack_of_fit_p=p),
-            poses=results,
-            condition=float(np.linalg.cond(directions)),
-            dilution=bias_dilution(directions),
-            birge_ratio=raised,
-            dof=max(n - 3.0, 1.0) if raised > 1 else max(self.pure_dof, 1.0),
-            shape_errors=dict(c.shape_errors),
-            blind_to=c.blind_to,
-            cautions=tuple(self._cautions(all_poses, shift, raised)),
-            weights=dict(c.weights),
-            holds_at=self._holds_at(),
-            update=update,
-        )
+        # Noise is estimated by the poses themselves, scatter by the residuals of
+        # the earlier calibration, which may have been small by chance.
+        left, miss = self.earlier.residual_dof, self._miss(bias)
+        dof = 1 / (1 / (self.pure_dof if self.pure_dof >= 1 else DOF_MOST) + (1 / left if left > 0 else 0.0))
+        return _ByPosesAlone(bias - begin, variance, miss, float(miss @ inverse @ miss), dof)
 
     def _fits(self) -> tuple[float | None, float]:
         """The probability of what the poses leave beside three biases, and by
         what that raises the errors of the poses. Raises Refused where it is too
         small for what is kept."""
+        off = max(float(np.max(np.abs(self.alone.shift))), rms(self.alone.miss)) / self.c.reference
+        if not off < UNLIKE:
+            raise Refused(
+                f"biases would move, or |a| stays off, by {plain(off, 2)} of the reference: is it another unit, or are "
+                "signs, order or unit of its outputs others?"
+            )
         left = len(self.poses) - 3
-        p = probability(lack_of_fit_p(self.alone.chi2, left, self.pure_dof if self.pure_dof >= 1 else 1e6))
+        p = probability(lack_of_fit_p(self.alone.chi2, left, self.alone.dof))
         if p is None or p >= SIGNIFICANT:
             return p, 1.0
         ratio = float(np.sqrt(self.alone.chi2 / left))
@@ -362,23 +308,100 @@ class _Update:
             )
         return p, max(ratio, 1.0)
 
+    def _estimated(self, prior: Floats) -> tuple[Floats, Floats, Floats]:
+        """The biases (3,) given the poses, |a| by the parameters there
+        (n,9+p), and the gain (9+p,n), in which kept parameters have zeros."""
+        begin = bias = self.c.sensor.bias
+        for _ in range(STEPS_MOST):
+            J = self._jacobian(bias)
+            gain = prior @ J.T @ np.linalg.inv(J @ prior @ J.T + np.diag(self.variance))
+            moved = begin + gain[6:9] @ (J[:, 6:9] @ (bias - begin) - self._miss(bias))
+            step, bias = moved - bias, moved
+            if np.max(np.abs(step)) <= CONVERGED * self.c.reference:
+                break
+        return bias, J, np.where(_is_bias(len(gain))[:, None], gain, 0.0)
+
+    def _covariances(self, J: Floats, gain: Floats, raised: float) -> dict[str, Floats]:
+        """Of the errors of all parameters, by their source: Joseph's form,
+        which holds for any gain."""
+        rest = np.eye(len(gain)) - gain @ J
+        found = {
+            "noise": (gain * self.noise**2) @ gain.T,
+            "scatter": gain @ gain.T * self.earlier.scatter_g**2,
+            "lack_of_fit": (gain * self.variance) @ gain.T * (raised**2 - 1),
+            "kept": rest @ self.earlier.covariance @ rest.T,
+            "since": rest @ self.since @ rest.T,
+        }
+        return {name: v for name, v in found.items() if np.any(v)}
+
+    def calibration(self, all_poses: Sequence[Pose]) -> Calibration:
+        """Of all that were given, those with a fault are told."""
+        p, raised = self._fits()
+        bias, J, gain = self._estimated(self.earlier.covariance + self.since)
+        covariances = self._covariances(J, gain, raised)
+        miss, shift = self._miss(bias), bias - self.c.sensor.bias
+        leverage = np.clip(np.einsum("np,pn->n", J, gain), 0.0, 1.0)
+        up = replace(self.c.sensor, bias=bias).up(self.u, self.covariates)
+        return replace(
+            self.c,
+            sensor=replace(self.c.sensor, bias=bias),
+            covariance=sum(covariances.values(), start=np.zeros_like(self.since)),
+            residual=self._residual(miss, leverage, p),
+            poses=self._results(up, miss, leverage, raised),
+            condition=float(np.linalg.cond(up)),
+            dilution=bias_dilution(up),
+            birge_ratio=raised,
+            dof=max(len(self.poses) - 3.0, 1.0) if raised > 1 else max(self.pure_dof, 1.0),
+            cautions=tuple(self._cautions(all_poses, shift, raised)),
+            holds_at=self._holds_at(),
+            slopes=False,
+            excess_g=0.0,
+            prior_sd=None,
+            thermal=None,
+            linear_only=None,
+            update=self._update(covariances, shift),
+        )
+
+    def _residual(self, miss: Floats, leverage: Floats, p: float | None) -> Residual:
+        alone = miss / np.maximum(1 - leverage, 1e-9)  # of each pose under all others
+        crossed = rms(alone) if np.all(leverage < 1 - 1e-6) else None
+        return Residual.of(miss, self.noise, cross_validated_rms_g=crossed, lack_of_fit_p=p)
+
+    def _results(self, up: Floats, miss: Floats, leverage: Floats, raised: float) -> tuple[PoseResult, ...]:
+        error = np.sqrt(self.variance) * raised
+        off = studentized(miss, error, leverage)
+        return pose_results(self.poses, up, miss, self.noise, off, leverage, total=error)
+
+    def _update(self, covariances: dict[str, Floats], shift: Floats) -> BiasUpdate:
+        before = self._miss(self.c.sensor.bias)
+        return BiasUpdate(
+            earlier=self.earlier.origin,
+            covariances=covariances,
+            before=Residual.of(before, self.noise),
+            before_residual_g=before,
+            shift=shift,
+            shift_error=np.sqrt(np.diag(self.earlier.covariance)[6:9] + self.expected**2),
+            scatter_g=self.earlier.scatter_g,
+            scatter_dof=self.earlier.residual_dof,
+            start_to_start=self.start_to_start,
+            measured=self.earlier.measured,
+        )
+
     def _cautions(self, all_poses: Sequence[Pose], shift: Floats, raised: float) -> Iterator[Caution]:
-        c = self.earlier.calibration
         if faulty := tuple((p.began, p.fault) for p in all_poses if p.fault):
             yield FaultyPosesExcluded(faulty)
         if raised > 1:
             yield BirgeRatio(raised)
-        expected = self.start_to_start
-        p = probability(float(chi2_sf(float(shift @ shift) / max(expected, 1e-300) ** 2, 3)))
+        p = probability(float(chi2_sf(float(shift @ shift) / max(self.expected, 1e-300) ** 2, 3)))
         if p is not None and p < LACK_OF_FIT:
-            yield BiasMoved(float(np.linalg.norm(shift)) / np.sqrt(3) / c.reference, expected / c.reference, p)
+            g = self.c.reference
+            yield BiasMoved(float(np.linalg.norm(shift)) / np.sqrt(3) / g, self.expected / g, p)
 
     def _holds_at(self) -> HoldsAt | None:
         """Effects of time are those of the earlier recording, at its moment;
         without them the biases are the mean over the poses."""
-        c = self.earlier.calibration
-        timed = any({TIME, SINCE_START, DURATION} & set(effect.needs) for effect, _ in c.sensor.effects)
-        return c.holds_at if timed else HoldsAt.of(self.poses, Moment.MEAN)
+        timed = any({TIME, SINCE_START} & set(effect.needs) for effect, _ in self.c.sensor.effects)
+        return self.c.holds_at if timed else HoldsAt.of(self.poses, Moment.MEAN)
 
 
 def _is_bias(n: int) -> Bools:

@@ -146,6 +146,7 @@ def _rezero(update: BiasUpdate, poses: int, reference: float) -> Document:
             "shift": numbers(update.shift),
             "expected_shift": numbers(update.shift_error, UNCERTAINTY_DIGITS),
             "scatter_g": uncertainty(update.scatter_g),
+            "scatter_dof": uncertainty(update.scatter_dof),
         },
         "origin": {
             "calibration": {"name": earlier.calibration or None, "sha256": earlier.sha256},

@@ -13,7 +13,6 @@ import numpy as np
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Origin
 from triaxcal.inputs.bias_update import Earlier
-from triaxcal.interchange.calibration_document import LINEAR
 from triaxcal.interchange.calibration_reading import (
     calibration_of,
     calibration_part,
@@ -21,6 +20,7 @@ from triaxcal.interchange.calibration_reading import (
     number_in,
     uncertainty_over_error,
 )
+from triaxcal.model.sensor import LINEAR
 from triaxcal.uncertainty.next_recording import Source
 
 
@@ -35,11 +35,12 @@ def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Ea
     start_to_start = number_in(told.get("start_to_start_g"))
     blind_to, alone = part.get("blind_to"), part.get("linear_only")
     warm = logged_in(part, where=where).get(TEMPERATURE)
-    scatter, noise = _scatter(part)
+    scatter, dof, noise = _scatter(part)
     return Earlier(
         replace(fitted, blind_to=tuple(map(str, blind_to)) if isinstance(blind_to, list) else ()),
         fitted.covariance * np.outer(raised, raised),
         scatter_g=scatter,
+        residual_dof=dof,
         noise_g=noise,
         start_to_start=start_to_start if start_to_start >= 0 else None,
         measured=told.get("source") == Source.MEASURED.value,
@@ -49,18 +50,17 @@ def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Ea
     )
 
 
-def _scatter(part: Mapping[str, Any]) -> tuple[float, float]:
+def _scatter(part: Mapping[str, Any]) -> tuple[float, float, float]:
     """By the residuals: a standard deviation of |a| that every pose had beside
-    its noise, and one that has the noise in it. An update hands on the first,
-    which its few poses tell little of."""
-    held, updated, poses = part.get("residual"), part.get("rezero"), part.get("poses")
-    residual = held if isinstance(held, Mapping) else {}
-    rms, floor = number_in(residual.get("rms_g")), number_in(residual.get("noise_floor_g"))
+    its noise, by how many degrees of freedom, and one that has the noise in it.
+    An update hands on the first, which its few poses tell little of."""
+    residual, updated, poses = (part.get(name) for name in ("residual", "rezero", "poses"))
+    held = residual if isinstance(residual, Mapping) else {}
     used = sum(bool(p.get("used", True)) for p in poses if isinstance(p, Mapping)) if isinstance(poses, list) else 0
-    left = used - (len(LINEAR) * 3 if not isinstance(updated, Mapping) else 3)
-    whole = rms * math.sqrt(used / left) if left > 0 else math.nan
     if isinstance(updated, Mapping):
-        known = number_in(updated.get("scatter_g"))
-        return (known if known >= 0 else 0.0), whole
-    beside = whole**2 - floor**2
-    return (math.sqrt(beside) if beside > 0 else 0.0), whole
+        known, dof = (max(number_in(updated.get(name)), 0.0) for name in ("scatter_g", "scatter_dof"))
+        return known, dof, number_in(held.get("rms_g")) * math.sqrt(used / max(used - 3, 1))
+    left = max(used - LINEAR, 0)
+    variance = number_in(held.get("rms_g")) ** 2 * used / left if left else math.nan
+    beside = variance - number_in(held.get("noise_floor_g")) ** 2
+    return (math.sqrt(beside) if beside > 0 else 0.0), float(left), math.sqrt(variance)

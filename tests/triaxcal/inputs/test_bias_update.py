@@ -347,6 +347,39 @@ def test_what_residuals_of_the_earlier_fit_show_beside_noise_counts() -> None:
     assert fit(rough, signs=SIGNS).excess_g == pytest.approx(earlier.scatter_g, rel=0.3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [4, 14])
+def test_a_stand_that_does_not_come_back_is_no_reason_to_refuse(count: int) -> None:
+    """Which the residuals of the earlier fit tell, by few degrees of freedom."""
+    refused = 0
+    for seed in range(100):
+        rng = np.random.default_rng([seed, 3])
+        first, today = (
+            [
+                replace(p, mean=p.mean + 2 * NOISE * rng.standard_normal(3) * UNIT.scale_factor)
+                for p in poses_of(unit, ups, int(rng.integers(1e9)))
+            ]
+            for unit, ups in ((UNIT, CUBE[:14]), (shifted(), CUBE[:14] if count == 14 else TETRAHEDRON))
+        )
+        try:
+            tc.rezero(tc.calibrate(first, signs=SIGNS), today)
+        except tc.Refused:
+            refused += 1
+    assert refused == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("scale_factor", v) for v in (1e-300, -1e-160, 1e150, 1e300)]
+    + [(name, v) for name in ("bias", "misalignment") for v in (1e6, -1e150, 1e300)],
+)
+def test_absurd_numbers_of_a_file_are_refused(name: str, value: float) -> None:
+    document = calibrated().to_dict()
+    document[name] = [value, *document[name][1:]]
+    with pytest.raises((tc.Refused, tc.InvalidData)):
+        tc.rezero(tc.Calibration.from_dict(document), poses_of(shifted(), CUBE))
+
+
 @pytest.mark.datasets
 @pytest.mark.slow
 def test_the_next_real_run_is_better_by_four_poses_and_never_much_worse() -> None:
