@@ -58,6 +58,8 @@ def rezero_command(a: argparse.Namespace) -> int:
     else:
         _show(found, choice)
         warn([*map(text.caution, found.cautions), *measured.data_quality])
+    if a.poses is not None and len(found.poses) < a.poses:
+        warn([f"--poses {a.poses}: {measured.name} has {len(found.poses)} distinct poses"])
     return judge(a.limit, found.residual.rms_g, found.reference)
 
 

@@ -110,6 +110,13 @@ def test_fewer_than_three_poses_are_refused(
         done.failed(3, "refused: 2 distinct still poses", "add the poses ")
 
 
+def test_fewer_distinct_poses_than_asked_for_are_told(workshop: Any, triaxcal: Run, earlier: Path) -> None:
+    done = triaxcal("rezero", earlier, means(workshop, TODAY, FOUR), "--pose-means", "--json", "--poses", "9")
+    assert done.code == 0
+    assert done.json["origin"]["poses"] == 4
+    assert "today.csv has 4 distinct poses" in done.err
+
+
 def test_missing_directions_are_named(workshop: Any, triaxcal: Run, earlier: Path) -> None:
     flat = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
     done = triaxcal("rezero", earlier, means(workshop, TODAY, flat), "--pose-means")
