@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         diagnose,
         find_poses,
         plan,
+        rezero,
         verify,
     )
     from triaxcal.documents import Calibration
@@ -51,6 +52,7 @@ _WHERE = {
     "diagnose": "triaxcal.api",
     "find_poses": "triaxcal.api",
     "plan": "triaxcal.api",
+    "rezero": "triaxcal.api",
     "verify": "triaxcal.api",
 }
 
@@ -72,6 +74,7 @@ __all__ = [
     "diagnose",
     "find_poses",
     "plan",
+    "rezero",
     "verify",
 ]
 

@@ -13,7 +13,7 @@ from triaxcal import text, uncertainty
 from triaxcal.arrays import Floats, rms
 from triaxcal.diagnosis import Candidate, Finding, Recommendation
 from triaxcal.diagnosis import diagnose as diagnosed
-from triaxcal.documents import Calibration
+from triaxcal.documents import Calibration, earlier_of
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
@@ -22,6 +22,7 @@ from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
 from triaxcal.evidence.partial_residuals import Trace
+from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
 from triaxcal.model.moment import Moment
@@ -304,6 +305,27 @@ def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> V
     )
     reference = (calibration.reference_unit, c.reference)
     return Verification(tuple(found), error, noise, calibration.uncertainty_in(found), reference)
+
+
+def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | None = None, **how: Any) -> Calibration:
+    """The calibration with three biases anew, by still poses of a later
+    recording: scale factors, misalignments and effects are kept.
+
+    ``poses`` from `find_poses`, or what that takes; of them the ``first`` so
+    many that are 45° apart (10° where there are fewer), or all. The uncertainty
+    is that of today: what the calibration says of itself, what changes from
+    recording to recording, and the poses. Raises Refused where these do not
+    determine three biases, or where what is kept no longer fits; InvalidData.
+    """
+    if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
+        raise InvalidData(f"first: expected a whole number of at least 1, not {first!r}")
+    found = updated_biases(_poses(poses, u, **how), earlier_of(calibration), first=first)
+    return Calibration(
+        found,
+        output_unit=calibration.output_unit,
+        reference_unit=calibration.reference_unit,
+        stated=calibration.stated,
+    )
 
 
 def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:

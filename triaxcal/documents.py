@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import errno
+import hashlib
 import json
 import os
 import warnings
@@ -22,10 +23,12 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, channel_of, covariate_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
-from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import HoldsAt, Origin, PoseResult, Residual
+from triaxcal.inputs.bias_update import Earlier
 from triaxcal.interchange import tables
 from triaxcal.interchange.calibration_document import Document, calibration_document
 from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, uncertainty_over_error
+from triaxcal.interchange.earlier_calibration import earlier_in
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.stream_covariates import InStream, followed
@@ -422,6 +425,15 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         return text.html(self._fitted, self.output_unit, self.reference_unit, self.warnings)
+
+
+def earlier_of(calibration: Calibration, name: str = "", *, sha256: str = "", recording: str = "") -> Earlier:
+    """A calibration as what is known of its unit before a later ``recording``.
+    ``name`` and ``sha256`` are those of its file, by default the digest of what
+    `Calibration.save` writes."""
+    document = calibration.to_dict()
+    sha256 = sha256 or hashlib.sha256(to_text(document).encode()).hexdigest()
+    return earlier_in(document, Origin(name, sha256, recording), where=name or "document")
 
 
 def read_document(path: Path) -> Mapping[str, Any]:

@@ -21,8 +21,9 @@ from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
-from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.estimate.projected_calibration import Reduced, reduced
+from triaxcal.inputs.bias_update import Earlier, updated_biases
 from triaxcal.interchange.calibration_document import Document, budget_document, holds_of
 from triaxcal.model.sensor import Sensor
 from triaxcal.number_format import micro_g
@@ -33,7 +34,7 @@ from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
 from triaxcald.computer import compute_with_one_thread
-from triaxcald.documents import loop_document
+from triaxcald.documents import loop_document, rezero_document
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
@@ -49,12 +50,28 @@ TEMPERATURE = "temp_c"
 @dataclass(frozen=True)
 class Certified:
     """A certificate, what it stands on, and the registers that it asks for
-    (None where the device has none)."""
+    (None where the device has none). It stands on a ``loop``, or on an earlier
+    calibration ``updated`` by a few poses."""
 
     document: Document
-    loop: Loop
+    loop: Loop | None
     image: RegisterImage | None
     within_limits: bool
+    updated: Calibration | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        found = self.loop.after if self.loop is not None else self.updated
+        assert found is not None
+        return found
+
+    @property
+    def before(self) -> Residual:
+        """Of the linear model, or of the earlier calibration in these poses."""
+        if self.loop is not None:
+            return self.loop.before.residual
+        assert self.calibration.update is not None
+        return self.calibration.update.before
 
 
 def certify(
@@ -69,26 +86,34 @@ def certify(
     serial: str | None,
     signs: tuple[int, int, int],
     computed_with: Mapping[str, str],
+    earlier: Earlier | None = None,
 ) -> Certified:
     """``computed_with``: `software` of the station, so that an audit years
-    later can get the same bytes.
+    later can get the same bytes. ``earlier``: the calibration of which the
+    poses renew the biases alone.
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
     compute_with_one_thread()
-    loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
+    loop = updated = None
+    if earlier is None:
+        loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
+        after = loop.after
+    else:
+        after = updated = updated_biases(poses, earlier)
     profile = bundle.profile
     stated = station.stated(profile)
     measured_ns = pipeline.first_host_ns or 0
-    held = held_by_device(profile, loop.after)
+    held = held_by_device(profile, after)
     image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
-    result = loop_document(
-        loop,
-        data_quality=pipeline.data_quality() + creeping(poses),
-        output_unit=profile.output.unit,
-        stated=stated,
-        held_by_device=held.beside_process if held else None,
-    )
+    quality, output_unit = pipeline.data_quality() + creeping(poses), profile.output.unit
+    if loop is None:
+        result = rezero_document(after, data_quality=quality, output_unit=output_unit, stated=stated)
+    else:
+        beside = held.beside_process if held else None
+        result = loop_document(
+            loop, data_quality=quality, output_unit=output_unit, stated=stated, held_by_device=beside
+        )
     outside = over_limits(result["after"], station.limits)
     document: Document = {
         "format": "triaxcal.certificate/1",
@@ -114,9 +139,9 @@ def certify(
         "outside": outside,
         "result": result,
         "not_written": why_not_written(profile),
-        "registers": _registers_document(image, held, loop, poses, stated) if image and held else None,
+        "registers": _registers_document(image, held, after, poses, stated) if image and held else None,
     }
-    return Certified(document, loop, image, not outside)
+    return Certified(document, loop, image, not outside, updated)
 
 
 def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:
@@ -186,28 +211,28 @@ def with_registers(
 ) -> Certified:
     """With the registers for other coefficients, ``wanted`` by role, than were
     computed: those of a stored certificate that says the same."""
-    profile, loop, image = bundle.profile, certified.loop, certified.image
-    held = held_by_device(profile, loop.after)
+    profile, full, image = bundle.profile, certified.calibration, certified.image
+    held = held_by_device(profile, full)
     if image is None or held is None:
         return certified
     days = next((w.value for w in image.words if w.role == DATE_ROLE), 0)
     coefficients = {w.role: w.value for w in image.words if w.role not in (DATE_ROLE, CRC_ROLE)}
     image = build_image(profile, coefficients | dict(wanted), date_days=int(days))
-    poses = [p.pose for p in loop.after.poses]
-    words = _registers_document(image, held, loop, poses, station.stated(profile))
+    poses = [p.pose for p in full.poses]
+    words = _registers_document(image, held, full, poses, station.stated(profile))
     return replace(certified, image=image, document={**certified.document, "registers": words})
 
 
 def _registers_document(
-    image: RegisterImage, held: HeldByDevice, loop: Loop, poses: list[Pose], stated: Stated
+    image: RegisterImage, held: HeldByDevice, full: Calibration, poses: list[Pose], stated: Stated
 ) -> Document:
     registers = held.registers.calibration
     in_registers = list(registers.terms)
-    host = [name for name in loop.after.terms if name not in in_registers]
+    host = [name for name in full.terms if name not in in_registers]
     return {
         "terms": in_registers,
         "left_to_host": host,
-        "holds": registers_hold(registers, loop.after),
+        "holds": registers_hold(registers, full),
         "rms_g": error(held.beside_process.residual.rms_g),
         "cost_rms_g": error(held.registers.cost),
         "rounding_rms_g": error(rounding_cost(image, registers, poses)),

@@ -162,7 +162,7 @@ def _kept(check: Verification | None) -> bool:
 
 
 def _found(unit: SimulatedUnit, outcome: Outcome) -> bool:
-    if outcome.certified is None:
+    if outcome.certified is None or outcome.certified.loop is None:
         return False
     likely = {name for name, p in outcome.certified.loop.probabilities.items() if p >= Odds().reported}
     return likely == set(unit.truth)

@@ -21,7 +21,7 @@ from triaxcal.interchange.calibration_document import (
     residual_document,
 )
 from triaxcal.rounding import chance, error, known_to, number, numbers, uncertainty
-from triaxcal.text import diagnosis
+from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import next_recording
 from triaxcal.units import ErrorUnit, in_units_of
@@ -128,6 +128,31 @@ def _trace(trace: Trace, reference: float, reference_unit: str) -> Document:
             "y": [value(float(y), widest) for y in trace.curve],
             "half_width": [known_to(float(v), widest, reference) for v in trace.half_width],
         },
+    }
+
+
+def rezero_document(
+    c: Calibration,
+    *,
+    data_quality: Sequence[str] = (),
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: Stated | None = None,
+) -> Document:
+    """A calibration with biases anew in the place of a closed loop: it was not
+    searched for effects."""
+    assert c.update is not None
+    return {
+        "format": "triaxcal.rezero/1",
+        "summary": list(bias_update.lines(c, c.update, ErrorUnit.of(reference_unit, c.reference))),
+        "before": residual_document(c.update.before, c.reference),
+        "after": residual_document(c.residual, c.reference),
+        "findings": [],
+        "candidates": [],
+        "choices": [],
+        "data_quality": list(data_quality),
+        "advice": [],
+        "calibration": calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated),
     }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import triaxcal as tc
 
 PAGE = Path(__file__).with_suffix(".md")
-FUNCTIONS = ("find_poses", "calibrate", "diagnose", "verify", "plan", "budget")
+FUNCTIONS = ("find_poses", "calibrate", "diagnose", "verify", "rezero", "plan", "budget")
 CLASSES = ("Calibration", "Diagnosis", "Verification", "Poses", "Pose", "PlannedPose", "Stated")
 ERRORS = ("TriaxcalError", "InvalidData", "Refused", "MissingChannel")
 HEAD = """# Python

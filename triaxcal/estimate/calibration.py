@@ -15,7 +15,14 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.caution import Caution
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.covariates import channels_of, covariates, of_moment, of_readings, with_scale
+from triaxcal.poses.covariates import (
+    channels_of,
+    covariates,
+    covariates_elsewhere,
+    of_moment,
+    of_readings,
+    with_scale,
+)
 from triaxcal.poses.pose import Pose
 
 
@@ -177,6 +184,43 @@ def studentized(misses: Floats, error: Floats, leverage: Floats, least: float = 
 
 
 @dataclass(frozen=True)
+class Origin:
+    """What a calibration was made from, by name and digest; empty where nobody
+    said."""
+
+    calibration: str = ""
+    sha256: str = ""
+    recording: str = ""
+
+
+@dataclass(frozen=True)
+class BiasUpdate:
+    """What a calibration of which the biases alone are new
+    (`triaxcal.inputs.bias_update`) has of the ``earlier`` one.
+
+    ``covariances`` (9+p,9+p) of the parameters by their source add up to that
+    of the calibration. ``before`` is how well the magnitude came out in the
+    poses under the earlier one, ``shift`` (3,) what the biases moved by,
+    ``shift_error`` (3,) the standard deviations by which they were expected to.
+    ``scatter_g`` is a standard deviation of |a| that every pose of the unit has
+    beside its noise, known by ``scatter_dof`` degrees of freedom;
+    ``start_to_start`` that from one recording to another, ``measured`` or
+    assumed. All in the unit of the reference.
+    """
+
+    earlier: Origin
+    covariances: Mapping[str, Floats]
+    before: Residual
+    before_residual_g: Floats
+    shift: Floats
+    shift_error: Floats
+    scatter_g: float
+    scatter_dof: float
+    start_to_start: float
+    measured: bool
+
+
+@dataclass(frozen=True)
 class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
@@ -196,7 +240,8 @@ class Calibration:
     that thermal effects make which the model has not. ``holds_at`` None:
     effects of time count as long after the start, as in documents of 0.1.
     ``linear_only`` is the linear model fitted by itself, where there are
-    effects and somebody asked for it.
+    effects and somebody asked for it. ``update`` is what it has of an earlier
+    calibration of which it keeps all but the biases.
     """
 
     sensor: Sensor
@@ -219,6 +264,7 @@ class Calibration:
     thermal: Floats | None = field(default=None, repr=False)
     holds_at: HoldsAt | None = None
     linear_only: Calibration | None = field(default=None, repr=False)
+    update: BiasUpdate | None = field(default=None, repr=False)
 
     @property
     def moment(self) -> tuple[float, float] | None:
@@ -302,7 +348,12 @@ class Calibration:
         return of_readings(channels, self.channel_reference, n, clocks)
 
     def covariates_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
-        """Of poses of the recording that it was fitted to."""
+        """Of poses of the recording that it was fitted to. Effects of time of an
+        earlier recording count as at `holds_at` in those of an `update`."""
+        if self.update is not None:
+            return covariates_elsewhere(
+                poses, self.channel_reference, self.sensor.scale_factor, self.sensor.bias, self.moment
+            )
         known = channels_of(poses, self.channel_reference)
         channels = with_scale(known, poses, self.sensor.scale_factor, self.sensor.bias)
         return covariates(channels, self.channel_reference)

@@ -16,7 +16,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.contract import Effect, is_derived
-from triaxcal.estimate.calibration import Calibration, Residual
+from triaxcal.estimate.calibration import BiasUpdate, Calibration, Residual
 from triaxcal.model.directions import spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
@@ -72,8 +72,13 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
         prior_sd=None if c.prior_sd is None else c.prior_sd[own[9:]],
         weights={name: p for name, p in c.weights.items() if name in names},
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
+        update=None if c.update is None else _update(c.update, through),
     )
     return Reduced(_with_residual(calibration) if c.poses else calibration, rms(off))
+
+
+def _update(update: BiasUpdate, through: Floats) -> BiasUpdate:
+    return replace(update, covariances={n: through @ v @ through.T for n, v in update.covariances.items()})
 
 
 def _with_residual(c: Calibration) -> Calibration:

@@ -8,7 +8,7 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import BiasUpdate, Calibration, Exclusion, HoldsAt, PoseResult, Residual
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -129,13 +129,32 @@ def calibration_document(
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
         "residual": residual_document(c.residual, c.reference),
-        "poses": [_pose_result(p, c.reference) for p in c.poses],
+        "poses": _poses(c),
         "trends": c.slopes,
         "condition": uncertainty(c.condition),
         "dilution": uncertainty(c.dilution),
         "blind_to": list(c.blind_to),
         "warnings": [text.caution(caution) for caution in c.cautions],
         **({} if c.linear_only is None else {"linear_only": linear_only(c.linear_only)}),
+        **({} if c.update is None else _rezero(c.update, len(c.poses), c.reference)),
+    }
+
+
+def _rezero(update: BiasUpdate, poses: int, reference: float) -> Document:
+    earlier = update.earlier
+    return {
+        "rezero": {
+            "before": residual_document(update.before, reference),
+            "shift": numbers(update.shift),
+            "expected_shift": numbers(update.shift_error, UNCERTAINTY_DIGITS),
+            "scatter_g": uncertainty(update.scatter_g),
+            "scatter_dof": uncertainty(update.scatter_dof),
+        },
+        "origin": {
+            "calibration": {"name": earlier.calibration or None, "sha256": earlier.sha256},
+            "recording": {"name": earlier.recording or None},
+            "poses": poses,
+        },
     }
 
 
@@ -147,6 +166,14 @@ def _units(output_unit: str, reference_unit: str) -> Document:
         "misalignment": "rad",
         "bias": reference_unit,
     }
+
+
+def _poses(c: Calibration) -> list[Document]:
+    out = [_pose_result(p, c.reference) for p in c.poses]
+    if c.update is not None:
+        for pose, before in zip(out, c.update.before_residual_g, strict=True):
+            pose["before_residual_g"] = error(float(before), c.reference)
+    return out
 
 
 def _pose_result(p: PoseResult, reference: float) -> Document:

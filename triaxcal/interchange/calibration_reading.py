@@ -48,8 +48,8 @@ def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
     used = [p for p in poses if isinstance(p, Mapping) and p.get("used", True)] if isinstance(poses, list) else []
     found = [p.get("channels") for p in used]
     rows = [row if isinstance(row, Mapping) else {} for row in found]
-    names = [str(n) for n in rows[0] if all(math.isfinite(_number(row.get(n))) for row in rows)] if rows else []
-    return {covariate_of(n): np.array([_number(row[n]) for row in rows]) for n in names}
+    names = [str(n) for n in rows[0] if all(math.isfinite(number_in(row.get(n))) for row in rows)] if rows else []
+    return {covariate_of(n): np.array([number_in(row[n]) for row in rows]) for n in names}
 
 
 def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float | None:
@@ -57,7 +57,7 @@ def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float
     found: Any = calibration_part(document, where=where)
     for key in ("uncertainty", "magnitude", "expanded_g"):
         found = found.get(key) if isinstance(found, Mapping) else None
-    value = _number(found)
+    value = number_in(found)
     return value if math.isfinite(value) else None
 
 
@@ -115,12 +115,12 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
         channel_reference=channel_reference,
         residual=_residual(part),
         poses=(),
-        condition=_number(part.get("condition")),
-        dilution=_number(part.get("dilution")),
+        condition=number_in(part.get("condition")),
+        dilution=number_in(part.get("dilution")),
         birge_ratio=unknown,
         dof=unknown,
         weights={
-            name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := _number(held.get(WEIGHT)))
+            name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := number_in(held.get(WEIGHT)))
         },
         holds_at=holds_at_of(part, where=where),
     )
@@ -163,16 +163,17 @@ def _residual(part: Mapping[str, Any]) -> Residual:
     held = part.get("residual")
     found = held if isinstance(held, Mapping) else {}
     optional = ("cross_validated_rms_g", "lack_of_fit_p", "weighted_rms", "reduced_chi2")
-    known = {name: None if math.isnan(v := _number(found.get(name))) else v for name in optional}
+    known = {name: None if math.isnan(v := number_in(found.get(name))) else v for name in optional}
     return Residual(
-        rms_g=_number(found.get("rms_g")),
-        max_abs_g=_number(found.get("max_abs_g")),
-        noise_floor_g=_number(found.get("noise_floor_g")),
+        rms_g=number_in(found.get("rms_g")),
+        max_abs_g=number_in(found.get("max_abs_g")),
+        noise_floor_g=number_in(found.get("noise_floor_g")),
         **known,
     )
 
 
-def _number(value: object) -> float:
+def number_in(value: object) -> float:
+    """NaN for what is no number."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 

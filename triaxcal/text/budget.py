@@ -84,6 +84,17 @@ def _(b: of.ThermometerAt) -> str:
     return f"thermal effects, counted from {b.reference_c:.4g} °C"
 
 
+@basis.register
+def _(_: of.KeptParameters) -> str:
+    return "scale factors, misalignments and effects are those of the earlier calibration, with its uncertainty"
+
+
+@basis.register
+def _(b: of.ChangedSince) -> str:
+    known = "as measured between recordings of this unit" if b.measured else "assumed as usual for such units"
+    return f"what changes from recording to recording, {known}: scale factors in full, biases as the poses leave it"
+
+
 def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
     """What would halve a component. ``small`` writes an error of the magnitude
     in the reference's unit."""
@@ -96,6 +107,8 @@ def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
             return "wait before each pose until the outputs creep by half as much"
         case of.CompleteModel():
             return "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
+        case of.FittedAnew():
+            return "record a whole set of poses (triaxcal plan) and fit all parameters anew"
         case of.ReferenceKnown(to_g):
             return f"know the reference to {small(to_g)}"
         case of.HostCorrects():

@@ -10,9 +10,9 @@ import numpy as np
 from triaxcal.estimate import caution as of_fit
 from triaxcal.frames import faces, frames, orientations, standing
 from triaxcal.inputs import attitude_cautions as attitude
-from triaxcal.inputs import datasheet
+from triaxcal.inputs import bias_update, datasheet
 from triaxcal.inputs.turning import rotation
-from triaxcal.number_format import micro_g, number_of
+from triaxcal.number_format import micro_g, number_of, plain
 from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.uncertainty import extrapolation
 
@@ -170,6 +170,15 @@ def _changed(c: datasheet.DatasheetContradicted) -> str:
 @caution.register
 def _(c: datasheet.StillOfDatasheet) -> str:
     return f"these poses say next to nothing of {', '.join(c.parameters)}: the values are still the datasheet's"
+
+
+@caution.register
+def _(c: bias_update.BiasMoved) -> str:
+    times = plain(c.shift / c.expected, 2)
+    return (
+        f"the biases moved by {times} times what they do from recording to recording by the calibration "
+        f"(probability {c.p:.1g})"
+    )
 
 
 @caution.register

@@ -3,7 +3,7 @@ Satterthwaite, and which dominates."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,8 @@ from triaxcal.uncertainty.budget_statements import (
     TemperatureNotLogged,
     ThermometerNotStated,
 )
-from triaxcal.uncertainty.components import Component, not_held, reference, rounding, statistical
-from triaxcal.uncertainty.propagation import ErrorPropagation
+from triaxcal.uncertainty.components import Component, not_held, of_update, reference, rounding, statistical
+from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
 
@@ -77,20 +77,32 @@ class Budget:
 
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
     """The budget of a calibration fitted to still poses
-    (`triaxcal.estimate.pose_fit.fit`)."""
+    (`triaxcal.estimate.pose_fit.fit`), or with biases from them
+    (`triaxcal.inputs.bias_update`)."""
     stated = stated or Stated()
+    if calibration.update is not None:
+        sphere = SphereMean.of(calibration)
+        found = of_update(calibration, calibration.update, sphere)
+        found += [*not_held(calibration, stated), *rounding(calibration, sphere, stated)]
+        return _budget(calibration, found, level, [ReferenceTakenAsExact()] if stated.reference is None else [])
     linearised = ErrorPropagation(calibration)
     thermal, excess = temperature(calibration, linearised, stated)
     found = [*statistical(calibration, linearised, excess), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
     found += not_held(calibration, stated)
     found += rounding(calibration, linearised, stated)
+    return _budget(calibration, found, level, _not_evaluated(calibration, linearised, stated))
+
+
+def _budget(
+    calibration: Calibration, found: list[Component], level: float, not_evaluated: Iterable[NotEvaluated]
+) -> Budget:
     found.sort(key=lambda c: -c.magnitude)
     return Budget(
         tuple(found),
         _combined([(c, c.parameters) for c in found], calibration.dof, level, calibration.standard_errors),
         _combined([(c, np.asarray(c.magnitude)) for c in found], calibration.dof, level, np.zeros(())),
-        tuple(_not_evaluated(calibration, linearised, stated)),
+        tuple(not_evaluated),
     )
 
 

@@ -102,6 +102,21 @@ class ThermometerAt(Basis):
 
 
 @dataclass(frozen=True)
+class KeptParameters(Basis):
+    """Scale factors, angles and effects are those of an earlier calibration,
+    with its uncertainty."""
+
+
+@dataclass(frozen=True)
+class ChangedSince(Basis):
+    """Of what changes from recording to recording, by the earlier calibration
+    (``measured``) or assumed: all of the scale factors', and of the biases' as
+    much as the poses leave open."""
+
+    measured: bool
+
+
+@dataclass(frozen=True)
 class Remedy:
     """What would halve a component."""
 
@@ -122,6 +137,11 @@ class CreepHalved(Remedy):
 @dataclass(frozen=True)
 class CompleteModel(Remedy):
     """Find what the model lacks, and record more poses."""
+
+
+@dataclass(frozen=True)
+class FittedAnew(Remedy):
+    """All parameters by a whole set of poses."""
 
 
 @dataclass(frozen=True)

@@ -3,25 +3,28 @@ the temperature have their own file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.calibration import BiasUpdate, Calibration
 from triaxcal.poses.degrees_of_freedom import within_pose_dof
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty.budget_statements import (
     AveragedModels,
     Basis,
     BirgeFactor,
+    ChangedSince,
     CompleteModel,
     Creep,
     CreepHalved,
     Excess,
     FinerRegisters,
+    FittedAnew,
     HostCorrects,
+    KeptParameters,
     LongerOrMorePoses,
     ModelsDistinguished,
     NotHeld,
@@ -30,7 +33,7 @@ from triaxcal.uncertainty.budget_statements import (
     Remedy,
     WithinPoseScatter,
 )
-from triaxcal.uncertainty.propagation import ErrorPropagation
+from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
 from triaxcal.uncertainty.stated import Stated
 
 CERTAIN = 0.99
@@ -59,7 +62,7 @@ class Component:
     @classmethod
     def of(
         cls,
-        linearised: ErrorPropagation,
+        sphere: SphereMean,
         source: str,
         evaluation: str,
         dof: float,
@@ -70,7 +73,7 @@ class Component:
         """Of a source by the ``covariance`` (p,p) of the parameters that it
         makes; ``by`` what would halve it."""
         parameters = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), basis, by)
+        return cls(source, evaluation, dof, parameters, sphere.magnitude(covariance), basis, by)
 
 
 def statistical(calibration: Calibration, linearised: ErrorPropagation, share: float) -> list[Component]:
@@ -145,6 +148,30 @@ def reference(linearised: ErrorPropagation, stated: Stated) -> list[Component]:
     return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_basis, by)]
 
 
+def of_update(calibration: Calibration, update: BiasUpdate, sphere: SphereMean) -> list[Component]:
+    """What the poses of an update leave open, and what it keeps."""
+    poses = [p.pose for p in calibration.poses if p.used]
+    bases: Mapping[str, tuple[Basis, Remedy]] = {
+        "noise": (WithinPoseScatter(len(poses), _median_duration_s(poses)), half_the_noise(poses)),
+        "lack_of_fit": (BirgeFactor(calibration.birge_ratio), FittedAnew()),
+        "scatter": (Excess(update.scatter_g / calibration.reference), FittedAnew()),
+        "kept": (KeptParameters(), FittedAnew()),
+        "since": (ChangedSince(update.measured), FittedAnew()),
+    }
+    of_noise = ("noise", "lack_of_fit")
+    return [
+        Component.of(
+            sphere,
+            source,
+            "A" if source in of_noise else "B",
+            calibration.dof if source in of_noise else np.inf,
+            covariance,
+            *bases[source],
+        )
+        for source, covariance in update.covariances.items()
+    ]
+
+
 def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
     if not stated.not_held:
         return []
@@ -152,9 +179,9 @@ def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
     return [Component("not_held", "B", np.inf, none, stated.not_held, NotHeld(), HostCorrects())]
 
 
-def rounding(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> list[Component]:
+def rounding(calibration: Calibration, sphere: SphereMean, stated: Stated) -> list[Component]:
     if not stated.rounding:
         return []
     steps = np.array([stated.rounding.get(name, 0.0) for name in calibration.parameters])
     basis = RegisterSteps(int(np.count_nonzero(steps)))
-    return [Component.of(linearised, "register_rounding", "B", np.inf, np.diag(steps**2 / 12), basis, FinerRegisters())]
+    return [Component.of(sphere, "register_rounding", "B", np.inf, np.diag(steps**2 / 12), basis, FinerRegisters())]

@@ -47,7 +47,10 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
     """``start_to_start`` is known of the unit's type, in the unit of the
     reference; from several recordings it is measured."""
     measured = _between_runs(c)
-    if measured is not None:
+    if c.update is not None:  # how many recordings told the earlier one is not known
+        start, dof = c.update.start_to_start, np.inf
+        source = Source.MEASURED if c.update.measured else Source.ASSUMED
+    elif measured is not None:
         start, dof, source = *measured, Source.MEASURED
     else:
         start = START_TO_START * c.reference if start_to_start is None else start_to_start

@@ -22,7 +22,30 @@ SPHERE = 200
 polynomial of the fourth degree there, which so many average well."""
 
 
-class ErrorPropagation:
+class SphereMean:
+    """The sphere that parameters are judged on. ``by_parameters`` (m,p): change
+    of |a| over the sphere by the parameters."""
+
+    by_parameters: Floats
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> SphereMean:
+        """At the conditions of its use."""
+        found, up = cls(), spiral(SPHERE) * calibration.reference
+        covariates = at_moment(calibration.channel_reference, len(up), calibration.moment)
+        u = calibration.sensor.output(up, covariates)
+        found.by_parameters = calibration.sensor.radius_by_parameters(u, covariates)
+        return found
+
+    def magnitude(self, covariance: Floats) -> float:
+        """rms over the sphere of the uncertainty of |a| that a covariance (p,p)
+        of the parameters makes."""
+        return float(
+            np.sqrt(max(np.einsum("mi,ij,mj->", *[self.by_parameters, covariance, self.by_parameters]), 0.0) / SPHERE)
+        )
+
+
+class ErrorPropagation(SphereMean):
     """The fit linearised at its solution, and the sphere that its parameters
     are judged on."""
 
@@ -60,7 +83,6 @@ class ErrorPropagation:
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)
         self.by_parameters = J @ np.linalg.inv(self.G)
-        """(m,p): change of |a| over the sphere by the parameters."""
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
         """Outputs of the unit all over the sphere, under the conditions of its
@@ -71,13 +93,6 @@ class ErrorPropagation:
         channels = {n: covariates[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
         return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, slopes=None)
-
-    def magnitude(self, covariance: Floats) -> float:
-        """rms over the sphere of the uncertainty of |a| that a covariance (p,p)
-        of the parameters makes."""
-        return float(
-            np.sqrt(max(np.einsum("mi,ij,mj->", *[self.by_parameters, covariance, self.by_parameters]), 0.0) / SPHERE)
-        )
 
     def when_shifted(self, calibration: Calibration, channel: str, by: float) -> Floats:
         """(p,) what the parameters would have to be for |a| to stay right were

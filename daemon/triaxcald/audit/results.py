@@ -15,6 +15,8 @@ from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
 from triaxcald.computer import compute_with_one_thread
+from triaxcald.earlier import ATTACHMENT as EARLIER
+from triaxcald.earlier import RECORD, EarlierFile
 from triaxcald.errors import DaemonError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
@@ -143,6 +145,16 @@ def _certified(
     if signs is None:
         raise ValueError("metadata unit.signs: expected three signs")
     named = recording.metadata.get("software", {})
+    file = _earlier(recording)
+    if file is not None:
+        file.require_of(
+            f"unit {unit.get('name', '')}",
+            serial=unit.get("serial") or None,
+            signs=signs,
+            reference=station.reference,
+            reference_unit="g",
+            output_unit=bundle.profile.output.unit,
+        )
     return certify(
         bundle,
         station,
@@ -154,7 +166,16 @@ def _certified(
         serial=unit.get("serial") or None,
         signs=signs,
         computed_with={name: named[name] for name in named if name not in DRAWN_WITH},
+        earlier=None if file is None else file.known(),
     )
+
+
+def _earlier(recording: Recording) -> EarlierFile | None:
+    """The calibration of which the recording renews the biases alone."""
+    name = recording.metadata.get(RECORD, {}).get("calibration")
+    if (name is None) != (EARLIER not in recording.attachments):
+        raise RecordingError(f"attachment {EARLIER}: without its metadata {RECORD}, or the other way round")
+    return None if name is None else EarlierFile.parsed(recording.attachments[EARLIER], name)
 
 
 def as_stored(again: Again, stored: Mapping[str, Mapping[str, Any] | None]) -> tuple[Again, Agreement]:

@@ -52,7 +52,7 @@ def fit_command(a: argparse.Namespace) -> int:
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
     )
     document["data_quality"] = measured.data_quality
-    _write(a, measured, document)
+    write_results(a, measured, document)
     if a.json:
         emit(document)
     else:
@@ -65,7 +65,7 @@ def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> 
     measured, document, calibration, show = way(a)
     warnings = document["warnings"]
     document["data_quality"] = measured.data_quality
-    _write(a, measured, document)
+    write_results(a, measured, document)
     if a.json:
         emit(document)
     else:
@@ -94,7 +94,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
     document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:
         document = with_recordings(document, loop, names)
-    _write(a, measured, document)
+    write_results(a, measured, document)
     if a.json:
         emit(document)
     else:
@@ -170,7 +170,9 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     return max(judge(a.limit, loop.after.residual.rms_g, loop.after.reference) for loop in loops)
 
 
-def _write(a: argparse.Namespace, measured: Measured, document: Document) -> None:
+def write_results(a: argparse.Namespace, measured: Measured, document: Document, shown: Document | None = None) -> None:
+    """``document`` as a file, and a page of it, or of what is ``shown`` in its
+    place."""
     if measured.unit:
         document["unit"] = dict(measured.unit)  # so that it cannot be written to another
     if a.report:  # before anything is written
@@ -182,10 +184,10 @@ def _write(a: argparse.Namespace, measured: Measured, document: Document) -> Non
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
         unit = chosen(a, measured).output_unit
         overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None
-        page = render_report(document, title=_title(measured.name), stream=overview, certificate=limits)
+        page = render_report(shown or document, title=title_of(measured.name), stream=overview, certificate=limits)
         write_text(a.report, page)
 
 
-def _title(name: str) -> str:
+def title_of(name: str) -> str:
     """Of a report: the file's name, wherever it lies."""
     return "standard input" if name == "-" else Path(name).name

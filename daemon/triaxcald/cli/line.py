@@ -36,11 +36,16 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     station.require_units()
+    rezero = {}
+    if a.rezero:
+        from triaxcald.earlier import earlier_by_unit
+
+        rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.line import run_station
 
     with Bars() as bars:
-        outcomes = run_interruptible(run_station(station, bars, force=a.force, ended=say_error))
+        outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
     with showing(worst(outcomes), _told(outcomes)):
         if a.json:
             emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
@@ -98,8 +103,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     """The before / after table of one unit, and where its papers are."""
 
     assert o.certified is not None
-    loop, v = o.certified.loop, o.verification
-    b, f = loop.before.residual, loop.after.residual
+    c, v = o.certified.calibration, o.verification
+    b, f = o.certified.before, c.residual
     rows: list[Sequence[Any]] = [
         ["fit: cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g), ""],
         ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
@@ -116,14 +121,15 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     for line in o.certified.document["result"]["summary"]:
         show(f"  {line}")
     least = Odds().reported
-    likely = [effect for effect, _ in loop.after.sensor.effects if loop.after.weights[effect.name] >= least]
-    rest = {e.name: loop.after.weights[e.name] for e, _ in loop.after.sensor.effects if e not in likely}
+    weights = {e.name: c.weights.get(e.name, 1.0) for e, _ in c.sensor.effects}
+    likely = [effect for effect, _ in c.sensor.effects if weights[effect.name] >= least]
+    rest = {e.name: weights[e.name] for e, _ in c.sensor.effects if e not in likely}
     if rest:
         each = ", ".join(f"{name} ({of_diagnosis.chance(p)})" for name, p in rest.items())
         show(f"  corrected as far as it is probable: {each}")
     for effect in likely:
-        show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(loop.after.weights[effect.name])})")
-        for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
+        show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(weights[effect.name])})")
+        for name, (value, error, unit) in c.coefficients_of(effect.name).items():
             show(f"    {name} {concise(value, error, unit)}")
     if o.provisioned:
         show(f"  {text.provisioned(o.provisioned)}")
@@ -142,9 +148,9 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         show(f"  outside limits: {line}")
     for line in o.certified.document["result"]["data_quality"]:
         show(f"  warning: {line}")
-    if creep := of_creep([p.pose for p in loop.after.poses]):
+    if creep := of_creep([p.pose for p in c.poses]):
         show(f"  creeping poses: {creep}")
-    for caution in loop.after.cautions:
+    for caution in c.cautions:
         show(f"  warning: {of_metrology.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
     for what, path in papers.items():

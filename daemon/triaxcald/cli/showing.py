@@ -46,12 +46,14 @@ def read_recording(
     moments: Moments | None = None,
     of: Calibration | None = None,
     turn_s: float | None = None,
+    wanted_by: Calibration | None = None,
 ) -> Measured:
     """The still poses of the recording ``name``, read as the arguments say; how
     a table was read is told. ``of`` is the calibration that is to be applied to
     them; ``turn_s`` as for `measure`. Raises InputError where that is of other
+    units. ``wanted_by`` is a calibration that needs its channels, of whatever
     units."""
-    found = measure(name, moments=moments, reading=reading_of(a, name, of), turn_s=turn_s)
+    found = measure(name, moments=moments, reading=reading_of(a, name, of or wanted_by), turn_s=turn_s)
     if of is not None:
         require_same_outputs(of, name, a.output_unit or found.output_unit)
     for remark in found.remarks:

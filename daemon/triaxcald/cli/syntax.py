@@ -73,6 +73,10 @@ def _line(commands: Any) -> None:
         "run station.toml",
     )  # fmt: skip
     p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument(
+        "--rezero", action="append", metavar="CAL",
+        help="renew the three biases of this calibration alone, by plan.rezero_poses poses; of several units once each",
+    )  # fmt: skip
     add_force(p)
     add_json(p)
     p = _command(
@@ -139,6 +143,15 @@ def _on_recordings(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p = _command(
+        commands, "rezero", "rezeroing:rezero_command", "renew the three biases of a calibration by a few poses",
+        "Scale factors, misalignments and effects are kept; three distinct poses are needed, four are better.",
+        "rezero cal.json rec.csv --poses 4 -o cal2.json",
+    )  # fmt: skip
+    p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
+    add_recording(p)
+    p.add_argument("--poses", type=count, metavar="N", help="the first N distinct poses; default: all")
+    _add_files(p)
+    p = _command(
         commands, "apply", "applying:apply_command", "calibrated readings of a recording",
         "Writes its samples with ax, ay, az behind them, in the unit of the reference vector (g, unless the "
         "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
@@ -198,6 +211,10 @@ def _three_errors(text: str) -> tuple[float, float, float]:
 
 def _add_results(p: argparse.ArgumentParser) -> None:
     add_uncertainty(p)
+    _add_files(p)
+
+
+def _add_files(p: argparse.ArgumentParser) -> None:
     p.add_argument("-o", "--output", type=Path, metavar="CAL.json")
     p.add_argument("--report", type=Path, metavar="R.html")
     p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this")

@@ -194,7 +194,8 @@ def read_document(document: Mapping[str, object]) -> Outcome:
     """The outcome that `document` describes; whatever is missing or of the
     wrong kind counts as missing."""
     looped = str(document.get("format", "")).startswith("triaxcal.loop/")
-    calibration = mapping(document.get("calibration")) if looped else document
+    inside = looped or str(document.get("format", "")).startswith("triaxcal.rezero/")
+    calibration = mapping(document.get("calibration")) if inside else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))
     names = file_names(texts(document.get("recordings")))
     poses = tuple(_poses(calibration, matrix, centre, names))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -14,6 +14,7 @@ from typing import Any
 
 from triaxcal.arrays import Floats
 from triaxcal.interchange.calibration_document import Document
+from triaxcal.model.bias_directions import bias_directions
 from triaxcal_drivers.errors import RegisterRefused
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
@@ -21,6 +22,8 @@ from triaxcald import text
 from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import Certified, certify, software, why_not_written
 from triaxcald.documents import to_text
+from triaxcald.earlier import ATTACHMENT as EARLIER
+from triaxcald.earlier import RECORD, EarlierFile
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DISK, REFUSED
 from triaxcald.files import write_text
@@ -94,7 +97,8 @@ class Outcome:
 
 class UnitRun(UnitSession):
     """The whole line for one unit of a station. ``force`` is the reason to
-    write in spite of doubts, ``others`` the units at work beside it."""
+    write in spite of doubts, ``others`` the units at work beside it. ``rezero``
+    is the calibration of which the biases alone are renewed."""
 
     def __init__(
         self,
@@ -106,8 +110,10 @@ class UnitRun(UnitSession):
         clock_ns: Callable[[], int] = time.time_ns,
         force: str | None = None,
         others: AtWork | None = None,
+        rezero: EarlierFile | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
+        self.rezero = rezero
         self.others, self.force = others or AtWork(1), force
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
@@ -131,10 +137,14 @@ class UnitRun(UnitSession):
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
                 path = self.recording_path(identity)
+                if self.rezero is not None:
+                    self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
                 await self._require_readings_before(device)
                 self._recording = path
-                with self.writer(self._recording, identity, ends_with=FORMAT) as writer:
+                with self.writer(self._recording, identity, ends_with=FORMAT, more=self._rezero_record) as writer:
+                    if self.rezero is not None:
+                        writer.attach(EARLIER, "application/json", self.rezero.data)
                     ending = await self._ending(device, identity, writer)
                     self._seal(writer, ending)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
@@ -287,6 +297,10 @@ class UnitRun(UnitSession):
             with suppress(RegisterRefused):  # what cannot be read is not written either
                 require_readings_before(self.profile, await self.registers(device))
 
+    @property
+    def _rezero_record(self) -> dict[str, dict[str, str]]:
+        return {} if self.rezero is None else {RECORD: {"calibration": self.rezero.name}}
+
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
@@ -295,7 +309,8 @@ class UnitRun(UnitSession):
         patience = Patience(plan.comes_back_s, others=self.others)
         returning = self.returning(device, identity, patience, confirmation=self._confirmation)
         async with self._confirmation.phase():
-            await self._collect(returning, writer, tumble, READINGS, plan.poses)
+            wanted = plan.poses if self.rezero is None else plan.rezero_poses
+            await self._collect(returning, writer, tumble, READINGS, wanted)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
@@ -357,6 +372,7 @@ class UnitRun(UnitSession):
             serial=identity.serial,
             signs=self.place.signs,
             computed_with=software(),
+            earlier=None if self.rezero is None else self.rezero.known(),
         )
 
     async def _collect(
@@ -368,12 +384,16 @@ class UnitRun(UnitSession):
         wanted: int,
         apart_from: Floats | None = None,
     ) -> None:
+        plan, targets = self.station.file.plan, None
+        if self.rezero is not None and stream == READINGS:
+            plan, targets = plan.model_copy(update={"repeat": False}), bias_directions(wanted)
         await collection.until_posed(
             device,
             writer,
-            self.station.file.plan,
+            plan,
             stream=stream,
             wanted=wanted,
+            targets=targets,
             nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
@@ -399,17 +419,29 @@ class UnitRun(UnitSession):
 
 
 async def run_station(
-    station: Station, progress: Progress, *, force: str | None = None, ended: Callable[[Outcome], None] = lambda _: None
+    station: Station,
+    progress: Progress,
+    *,
+    force: str | None = None,
+    rezero: Mapping[str, EarlierFile] | None = None,
+    ended: Callable[[Outcome], None] = lambda _: None,
 ) -> list[Outcome]:
     """All units of a station at once; one that fails does not stop the others,
     and ``ended`` is told of each at its end. One that is lost is waited for
-    while others are at work.
+    while others are at work. ``rezero`` has the calibrations, by unit, of which
+    the biases alone are renewed.
 
     When it is cancelled, every unit is, again each time, and put in order
     first; the outcomes then say 130.
     """
     serials, others = SerialsSeen(), AtWork(len(station.places))
-    runs = [UnitRun(station, place, progress, serials=serials, force=force, others=others) for place in station.places]
+    runs = [
+        UnitRun(
+            station, place, progress,
+            serials=serials, force=force, others=others, rezero=(rezero or {}).get(place.unit.name),
+        )
+        for place in station.places
+    ]  # fmt: skip
 
     async def work(run: UnitRun) -> Outcome:
         try:

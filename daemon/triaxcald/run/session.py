@@ -4,7 +4,7 @@ recording goes, and its coming back."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -146,15 +146,23 @@ class UnitSession:
         return folder / self.recording_name(identity)
 
     def writer(
-        self, path: Path, identity: IdentityRead, *, ends_with: str = "", segments: Segments | None = None
+        self,
+        path: Path,
+        identity: IdentityRead,
+        *,
+        ends_with: str = "",
+        segments: Segments | None = None,
+        more: Mapping[str, Mapping[str, str]] | None = None,
     ) -> RecordingWriter:
-        """With station file and profile in it. Raises RecordingError."""
+        """With station file and profile in it, and ``more`` metadata. Raises
+        RecordingError."""
         unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
         settings: dict[str, Any] = {
             "metadata": {
                 "station": {"name": self.station.file.name},
                 "unit": unit,
                 "software": {**(software() if ends_with else versions()), **drawn_with()},
+                **(more or {}),
             },
             "preview_channels": preview_channels(self.profile),
             "preview_unit": self.profile.output.unit,

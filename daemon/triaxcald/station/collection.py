@@ -27,7 +27,7 @@ from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.raw_records import RawRecords
 
 if TYPE_CHECKING:
-    pass
+    from triaxcal.model.directions import Direction
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the
@@ -233,12 +233,13 @@ class Collection(Recorded):
         nominal_scale_factor: Sequence[float] | None,
         tell: Callable[[Guide], None],
         apart_from: Floats | None = None,
+        targets: Sequence[Direction] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records until ``stream`` shows ``wanted`` distinct poses, and of the
         readings the first of them once more, if the plan says so; ``tell`` is
-        told how it goes. ``apart_from`` as in `guide`. A device that sends, but
-        no whole sample of ``stream``, hears of it.
+        told how it goes. ``apart_from`` and ``targets`` as in `guide`. A device
+        that sends, but no whole sample of ``stream``, hears of it.
 
         Raises NoPoses when no new pose has come for the plan's patience, and
         what the device's stream raises. Where only the repeat does not come, it
@@ -248,7 +249,7 @@ class Collection(Recorded):
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
         lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
         counted_s: tuple[float, ...] = ()
-        if stream == READINGS:
+        if stream == READINGS and targets is None:
             from triaxcal.model.directions import directions
 
             directions(wanted)  # put in order once, before there are samples to lose
@@ -273,6 +274,7 @@ class Collection(Recorded):
                     repeat=plan.repeat and stream == READINGS,
                     counted_s=counted_s,
                     apart_from=apart_from,
+                    targets=targets,
                 )
                 counted_s = state.counted_s
                 took_s = clock_s() - host_s

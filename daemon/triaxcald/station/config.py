@@ -47,6 +47,9 @@ class Plan(Strict):
     hold_s: Annotated[float, Field(ge=0.6, le=3600)] = 3.0
     repeat: Annotated[bool, Field(description="ask for the first pose once more at the end")] = True
     check_poses: Annotated[int, Field(ge=1, le=100)] = 6
+    rezero_poses: Annotated[
+        int, Field(ge=3, le=1000, description="poses of `run --rezero`, which renews the biases alone")
+    ] = 4
     apart_deg: Annotated[float, Field(ge=1, le=60, description="poses nearer than this count once")] = 10.0
     patience_s: Annotated[
         float, Field(gt=0, description="give up when no new pose has come for so long, in seconds of the samples")
@@ -172,7 +175,7 @@ class StationFile(Strict):
 
     @model_validator(mode="after")
     def _poses_fit_apart(self) -> Self:
-        for name in ("poses", "check_poses"):
+        for name in ("poses", "check_poses", "rezero_poses"):
             if self.plan.apart_deg > _farthest_apart_deg(getattr(self.plan, name)):
                 raise ValueError(f"plan.{name}: there are not so many directions {self.plan.apart_deg:g} degrees apart")
         return self

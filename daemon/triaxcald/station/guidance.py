@@ -61,6 +61,7 @@ def guide(
     repeat: bool = False,
     counted_s: Collection[float] = (),
     apart_from: Floats | None = None,
+    targets: Sequence[Direction] | None = None,
 ) -> Guide:
     """Judge the poses so far, which may come in any order; ``repeat`` asks for
     the first of them again at the end.
@@ -68,6 +69,9 @@ def guide(
     With ``apart_from`` (n,3), directions of up, only poses apart from those
     count. Who offers none of these is asked no longer once twice as many others
     have come as are wanted, or as many as there are to be apart from.
+
+    ``targets`` are the directions to ask for, by default those of a plan of so
+    many poses.
 
     ``now_s`` is the time of the latest sample, counted as the poses' times are.
     A pose that lies about one of ``counted_s`` was long enough once: it stays
@@ -97,7 +101,8 @@ def guide(
     only_near = bool(taken) and found < wanted <= in_all and in_all >= min(2 * wanted, len(taken))
     from triaxcal.model.directions import directions, elsewhere  # a recorder guides nobody
 
-    targets = directions(wanted) if plan else elsewhere(np.array(taken), wanted) if taken else []
+    if targets is None:
+        targets = directions(wanted) if plan else elsewhere(np.array(taken), wanted) if taken else []
     missing = _uncovered(targets, held) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
     if (found >= wanted or only_near) and not due:

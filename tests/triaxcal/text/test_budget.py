@@ -40,6 +40,20 @@ BASES: list[tuple[of.Basis, str]] = [
         "pose, but these poses cannot tell what that did",
     ),
     (of.ThermometerAt(25.0), "thermal effects, counted from 25 °C"),
+    (
+        of.KeptParameters(),
+        "scale factors, misalignments and effects are those of the earlier calibration, with its uncertainty",
+    ),
+    (
+        of.ChangedSince(measured=True),
+        "what changes from recording to recording, as measured between recordings of this unit: scale factors in full, "
+        "biases as the poses leave it",
+    ),
+    (
+        of.ChangedSince(measured=False),
+        "what changes from recording to recording, assumed as usual for such units: scale factors in full, biases as "
+        "the poses leave it",
+    ),
 ]
 REMEDIES: list[tuple[of.Remedy, str]] = [
     (of.LongerOrMorePoses(0.0, 104), "record 104 poses"),
@@ -49,6 +63,7 @@ REMEDIES: list[tuple[of.Remedy, str]] = [
         of.CompleteModel(),
         "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated",
     ),
+    (of.FittedAnew(), "record a whole set of poses (triaxcal plan) and fit all parameters anew"),
     (of.ReferenceKnown(5e-5), "know the reference to 50.0 µg"),
     (of.FinerRegisters(), "registers with one bit more"),
     (of.HostCorrects(), "correct in the host what the registers cannot hold"),

@@ -31,6 +31,7 @@ from triaxcal.inputs.attitude_cautions import (
     MagnitudeContradicts,
     Row,
 )
+from triaxcal.inputs.bias_update import BiasMoved
 from triaxcal.inputs.datasheet import DatasheetContradicted, StillOfDatasheet
 from triaxcal.inputs.turning.rotation import StretchesDiffer
 from triaxcal.poses.pose import PoseStart
@@ -139,6 +140,10 @@ SENTENCES: list[tuple[Caution, str]] = [
         SingleOrientation(("+Z",), 1.5e-3, given=False),
         "with +Z up the fixture stood one way only: the tilt of the table enters there, with a size of 0.0015 rad as "
         "on the other faces and an unknown direction",
+    ),
+    (
+        BiasMoved(6e-3, 2e-3, 3e-7),
+        "the biases moved by 3 times what they do from recording to recording by the calibration (probability 3e-07)",
     ),
 ]
 
