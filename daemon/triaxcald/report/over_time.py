@@ -171,7 +171,7 @@ def _residuals(
         axes.vlines(place, residual - half, residual + half, color=colour, lw=0.9)
     axes.plot(place[used], residual[used], "o-", color=colour, ms=size, lw=0.6)
     axes.plot(place[~used], residual[~used], "x", color=colour, ms=size + 2.0, mew=1.6)
-    if (~used).any() and used.any():
+    if (~used).any() and np.isfinite(residual[used]).any():
         _keep_used_in_sight(axes, residual, used)
 
 
