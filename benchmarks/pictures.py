@@ -61,7 +61,7 @@ def draw(path: Path, title: str, shown: Samples, each: Sequence[tuple[str, Seque
     lower.set_xlabel("s", fontsize=7)
     lower.tick_params(labelsize=7)
     lower.set_xlim(t_s[0], t_s[-1])
-    _save(path, figure)
+    save(path, figure)
 
 
 def draw_by_run(path: Path, label: str, panels: Sequence[Sequence[Line]]) -> None:
@@ -76,7 +76,7 @@ def draw_by_run(path: Path, label: str, panels: Sequence[Sequence[Line]]) -> Non
         ax.tick_params(labelsize=7)
     axes[0].set_ylabel(label, fontsize=7)
     axes[-1].legend(fontsize=6, frameon=False, ncols=2)
-    _save(path, figure)
+    save(path, figure)
 
 
 def draw_pairs(path: Path, labels: tuple[str, str], before: Floats, after: Floats, of: Sequence[str]) -> None:
@@ -95,10 +95,11 @@ def draw_pairs(path: Path, labels: tuple[str, str], before: Floats, after: Float
         axis.set_minor_formatter(NullFormatter())
     ax.tick_params(labelsize=7)
     ax.legend(fontsize=6, frameon=False)
-    _save(path, figure)
+    save(path, figure)
 
 
-def _save(path: Path, figure: Figure) -> None:
+def save(path: Path, figure: Figure) -> None:
+    """As a small PNG."""
     held = io.BytesIO()
     figure.savefig(held, format="png", dpi=110)
     plt.close(figure)

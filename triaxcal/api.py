@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
+from triaxcal.evidence.partial_residuals import Trace
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
@@ -33,6 +34,9 @@ from triaxcal.poses.stillness.detector import StillnessDetector
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class PlannedPose(NamedTuple):
@@ -89,7 +93,9 @@ class Diagnosis:
     certain, ``candidates`` more likely than not, and ``probabilities`` has that
     of every effect that was looked for; ``unexplained`` is what no effect
     describes, ``held_out`` the error in poses that no fit saw, ``advice`` what
-    to do, a line each. ``call`` is whether the calibration can be used."""
+    to do, an action a line, ``notes`` what else to know. ``call`` is whether the
+    calibration can be used. ``traces`` are what the poses show of each finding
+    and each candidate, against what drives it; `plot` draws them."""
 
     before: Calibration
     calibration: Calibration
@@ -101,12 +107,25 @@ class Diagnosis:
     next_recording: NextRecording
     held_out: HoldOut | None
     advice: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    traces: tuple[Trace, ...] = field(repr=False, default=())
     _lines: tuple[str, ...] = field(repr=False, default=())
 
     def summary(self) -> str:
         """Whether it can be used, what acts, the error before and after, and
         what to do, a line each."""
         return "\n".join(["Diagnosis", *(f"  {line}" for line in self._lines)])
+
+    def plot(self) -> Figure:
+        """The trace picture: the partial residual of each finding and each
+        candidate against what drives it, with the fitted curve and its 95 %
+        band; of what has no name against the variables that tell most of it;
+        the residuals where nothing is found. Raises ModuleNotFoundError without
+        matplotlib."""
+        from triaxcal.pictures import traces_figure  # matplotlib, which nothing else needs
+
+        c = self.calibration
+        return traces_figure(self.traces, ErrorUnit.of(c.reference_unit, c.fitted.reference))
 
     def __repr__(self) -> str:
         return self.summary()
@@ -260,6 +279,8 @@ def diagnose(
         following,
         closed_loop.held_out,
         tuple(diagnosis.advice(closed_loop, small)),
+        tuple(diagnosis.notes(closed_loop, small)),
+        closed_loop.traces,
         diagnosis.lines(closed_loop, small, following),
     )
 

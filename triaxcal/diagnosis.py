@@ -22,6 +22,7 @@ from triaxcal.evidence.findings import Findings, Named, findings
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.information_gain import Advice, advice, decided
 from triaxcal.evidence.model_average import Refusal, average, refusal
+from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.refinement import considered, posterior_of
@@ -32,6 +33,9 @@ from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
 
+SHOWN = 2
+"""Effects that are only corrected on average, at most, in `Loop.traces`: more
+would hide the likeliest."""
 Coefficients = Mapping[str, tuple[float, float | None, str]]
 """Name → value, standard error, unit."""
 
@@ -102,6 +106,34 @@ class Loop:
     not_identifiable: Mapping[str, NotIdentifiable]
     faulty: Mapping[str, str]
     posterior: Posterior = field(repr=False, compare=False)
+    conditional_on: Mapping[str, Calibration] = field(repr=False, compare=False)
+    """What the calibration would be if an effect acts, of findings that are not
+    corrected and of candidates."""
+
+    @cached_property
+    def traces(self) -> tuple[Trace, ...]:
+        """What the poses show of each finding and each candidate, against what
+        drives it; where there are none, of the likeliest effects that are
+        corrected all the same. Of what has no name, against the variables that
+        tell most of it. Where no effect probably acts, the residuals."""
+        rows = self.posterior.evidence.rows
+        names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
+        names = names or sorted(self.averaged, key=lambda name: -self.averaged[name])[:SHOWN]
+        of_names = [of_effect(rows, self.conditional_on.get(name, self.after), name) for name in names]
+        something = self.found.nothing < self.posterior.evidence.odds.reported
+        untold = self.found.unexplained.significant or (something and not names and not self.found.outliers)
+        of_rest = telling_variables(rows, self.after) if untold else ()
+        found = (*(trace for each in of_names for trace in each), *of_rest)
+        return found or (residuals(self.after),)
+
+    @property
+    def averaged(self) -> Mapping[str, float]:
+        """Effects that are corrected by as much as they are probable, and are
+        neither findings nor candidates: each with its probability."""
+        named = {name for f in self.findings for name in (f.effect, *f.alternatives)} | {
+            c.effect for c in self.candidates
+        }
+        return {name: p for name, p in self.after.weights.items() if name not in named}
 
     @property
     def probabilities(self) -> Mapping[str, float]:
@@ -177,12 +209,13 @@ def diagnose(
         after=after,
         found=found,
         findings=tuple(report.finding(named, refused) for named in found.named),
-        candidates=tuple(Candidate(name, p, report.conditional_on(name)[0]) for name, p in found.candidates.items()),
+        candidates=tuple(Candidate(n, p, report.if_it_acts(n)[0]) for n, p in found.candidates.items()),
         refusal=refused,
         held_out=None if sound_check is None else held_out(before, after, sound_check),
         not_identifiable=hidden,
         faulty=(dict(plugins()[1]) if catalogue is None else {}) | faulty,
         posterior=posterior,
+        conditional_on=dict(report.conditional),
     )
 
 
@@ -211,12 +244,14 @@ class _Report:
     posterior: Posterior
     moment: HoldsAt
     after: Calibration
+    conditional: dict[str, Calibration] = field(default_factory=dict)
+    """By name, as `if_it_acts` found them."""
 
     def finding(self, named: Named, refused: Refusal | None) -> Finding:
         probabilities = named.probabilities
         name, *others = probabilities
         adopted = not others and refused is None
-        coefficients, remedy = self._corrected(name) if adopted else self.conditional_on(name)
+        coefficients, remedy = self._of(self.after, name) if adopted else self.if_it_acts(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
@@ -227,15 +262,13 @@ class _Report:
             together=named.together,
         )
 
-    def conditional_on(self, name: str) -> tuple[Coefficients, str]:
-        """If it acts."""
+    def if_it_acts(self, name: str) -> tuple[Coefficients, str]:
         made = average(self.posterior.conditional_on(name), self.moment)
         reference = self.posterior.evidence.rows.problem.channel_reference
-        c = replace(self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference)
-        return self._of(c, name)
-
-    def _corrected(self, name: str) -> tuple[Coefficients, str]:
-        return self._of(self.after, name)
+        self.conditional[name] = replace(
+            self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference
+        )
+        return self._of(self.conditional[name], name)
 
     def _of(self, c: Calibration, name: str) -> tuple[Coefficients, str]:
         effect, q = next((e, q) for e, q in c.sensor.effects if e.name == name)

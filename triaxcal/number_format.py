@@ -19,13 +19,19 @@ def plain(value: float, digits: int = 3, sign: str = "") -> str:
     return f"{value:{sign}.0f}" if "e+" in text and abs(value) < 1e15 else text
 
 
+def three_digits(value: float, sign: str = "") -> str:
+    """With its zeros at the end, and with all digits before the point; without
+    an exponent up to a quadrillion."""
+    exponent = int(f"{value:.2e}".partition("e")[2])
+    return f"{value:{sign}.{max(2 - exponent, 0)}f}" if exponent < 15 else f"{value:{sign}.2e}"
+
+
 def micro_g(value: float | None, sign: str = "") -> str:
-    """A number of g in µg: to a tenth, as in tables, or to three digits where
-    that is finer."""
+    """A number of g in µg, to three digits."""
     if value is None:
         return "unknown"
     count = value * 1e6
-    return f"{count:{sign}.1f} µg" if 10 <= abs(count) < 1e15 else f"{plain(count, sign=sign)} µg"
+    return f"{three_digits(count, sign) if abs(count) >= 10 else plain(count, sign=sign)} µg"
 
 
 def probability(p: float | None) -> str:

@@ -3,19 +3,123 @@ when it is called."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from triaxcal.arrays import Bools, Floats
+from triaxcal.effects.contract import RUN
 from triaxcal.errors import InvalidData
+from triaxcal.evidence.partial_residuals import PREDICTED, Quantity, Trace
+from triaxcal.text import traces as words
 from triaxcal.units import ErrorUnit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SIZE_IN = (9.0, 4.0)
 """Width and height in inches: two panels side by side, legible across a page."""
+PANEL_IN, COLUMNS = (4.2, 2.9), 3
+"""Of a trace, and how many stand side by side."""
+IN_SIGHT = 3.0
+"""Times the largest value of the poses that are used and of the curve: what is
+excluded and farther off stands at the edge, as an arrow."""
+EXPECTED = 2.0
+"""Standard errors within which 95 % of residuals lie where noise is all."""
+
+
+@dataclass(frozen=True)
+class Inks:
+    """Colours of a trace."""
+
+    used: str = "C0"
+    excluded: str = "C3"
+    curve: str = "C1"
+    band: str = "#ff7f0e40"
+    zero: str = "0.7"
+
+
+def _figure(size_in: tuple[float, float]) -> Figure:
+    """One that a notebook shows."""
+    return _shown_in_notebooks()(figsize=size_in, layout="constrained")
+
+
+@cache
+def _shown_in_notebooks() -> type[Figure]:
+    from matplotlib.figure import Figure  # not pyplot: no window, no state
+
+    class NotebookFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            sheet = io.BytesIO()
+            self.savefig(sheet, format="png")
+            return sheet.getvalue()
+
+    return NotebookFigure
+
+
+def traces_figure(traces: Sequence[Trace], small: ErrorUnit) -> Figure:
+    """A panel for each, under its title. Raises InvalidData where there are
+    none."""
+    if not traces:
+        raise InvalidData("there is no trace to plot")
+    columns = min(COLUMNS, len(traces))
+    rows = -(-len(traces) // columns)
+    figure = _figure((PANEL_IN[0] * columns, PANEL_IN[1] * rows))
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, trace in zip(panels, traces, strict=False):
+        paint_trace(axes, trace, small)
+        axes.set_title(words.title(trace), loc="left")
+    for axes in panels[len(traces) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def paint_trace(axes: Axes, trace: Trace, small: ErrorUnit, inks: Inks | None = None) -> None:
+    """The partial residuals with one standard error either way, the fitted curve
+    and its 95 % band; crosses are poses that the fit does not use."""
+    inks = inks or Inks()
+    in_errors = trace.quantity is Quantity.STANDARD_ERRORS
+    unit = 1.0 if in_errors else small.count(1.0)
+    x, grid = (_shown(trace.variable, values, small) for values in (trace.x, trace.grid))
+    axes.axhline(0.0, color=inks.zero, linewidth=0.8)
+    if in_errors:
+        axes.axhspan(-EXPECTED, EXPECTED, color=inks.band, linewidth=0)
+    if len(grid):
+        low, high = unit * (trace.curve - trace.half_width), unit * (trace.curve + trace.half_width)
+        axes.fill_between(grid, low, high, color=inks.band, linewidth=0)
+        axes.plot(grid, unit * trace.curve, color=inks.curve, linewidth=1.6)
+    for those, colour, marker in ((~trace.excluded, inks.used, "o"), (trace.excluded, inks.excluded, "x")):
+        axes.errorbar(
+            x[those], unit * trace.y[those], unit * trace.error[those], fmt=marker, markersize=4, color=colour,
+            ecolor=colour, elinewidth=0.9,
+        )  # fmt: skip
+    _keep_used_in_sight(axes, x, unit * trace.y, unit * np.abs(trace.curve), trace.excluded, inks.excluded)
+    axes.set_xlabel(words.x_label(trace, small))
+    axes.set_ylabel(words.y_label(trace, small))
+
+
+def _shown(variable: str, values: Floats, small: ErrorUnit) -> Floats:
+    """The variable in the unit of its label."""
+    if variable == PREDICTED:
+        return np.asarray(small.count(1.0) * values)
+    return values + 1 if variable == RUN else values
+
+
+def _keep_used_in_sight(axes: Axes, x: Floats, y: Floats, curve: Floats, excluded: Bools, colour: str) -> None:
+    if excluded.all() or not excluded.any():
+        return
+    reach = IN_SIGHT * max(float(np.abs(y[~excluded]).max()), float(curve.max(initial=0.0)))
+    far = excluded & (np.abs(y) > reach)
+    if not far.any() or not reach > 0:
+        return
+    axes.set_ylim(-reach, reach)
+    for at, value in zip(x[far], y[far], strict=True):
+        axes.plot([at], [np.sign(value) * 0.93 * reach], "^" if value > 0 else "v", color=colour, markersize=6)
 
 
 def residuals_figure(document: Mapping[str, Any]) -> Figure:
@@ -23,8 +127,6 @@ def residuals_figure(document: Mapping[str, Any]) -> Figure:
     with their standard errors, and where the poses lie on the sphere, in an
     equal-area projection of both halves. Raises InvalidData where it has no
     poses."""
-    from matplotlib.figure import Figure  # not pyplot: no window, no state
-
     poses = document.get("poses") or []
     if not poses:
         raise InvalidData("there is no pose to plot: this calibration is not of still poses")
@@ -37,7 +139,7 @@ def residuals_figure(document: Mapping[str, Any]) -> Figure:
         up = np.array([p["direction"] for p in poses], dtype=float).reshape(len(poses), 3)
     except (AttributeError, KeyError, TypeError, ValueError) as e:
         raise InvalidData(f"poses that cannot be plotted: {e!r}") from None
-    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    figure = _figure(SIZE_IN)
     left, right = figure.subplots(1, 2, width_ratios=[3, 2])
     number = np.arange(1, len(poses) + 1)
     left.axhline(0.0, color="0.7", linewidth=0.8)

@@ -1,8 +1,8 @@
-"""Numbers as they stand in documents.
+"""Numbers as they stand in documents, and as people read them (`concise`).
 
-They are rounded far below any noise, and far above the last bits in which
-processors and linear algebra libraries differ, so that an audit on another
-machine gets the same bytes.
+In documents they are rounded far below any noise, and far above the last bits
+in which processors and linear algebra libraries differ, so that an audit on
+another machine gets the same bytes.
 """
 
 from __future__ import annotations
@@ -29,6 +29,13 @@ GRID_G = 1e-11
 """Errors of the magnitude are differences of numbers near 1 g: beyond this they
 differ from processor to processor. Of numbers near another reference, as much
 finer or coarser as that is smaller or larger, in powers of ten."""
+
+MISSING = "—"
+NARROW = "\u202f"
+"""The narrow space between groups of three digits."""
+LEAST_PLAIN, MOST_PLAIN = 0.1, 1e7
+"""Between these figures stand without a power of ten."""
+_SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 class Printed(float):
@@ -124,6 +131,66 @@ def direction(unit_vector: Floats) -> list[float]:
 def degrees(value: float) -> float:
     """To a tenth of a degree."""
     return _to_decimals(value, 1)
+
+
+def known_to(value: float, uncertainty: float, reference: float = 1.0) -> float | None:
+    """An error of the magnitude, as `error` has it, that is itself known with
+    this standard uncertainty."""
+    found = error(value, reference)
+    return Printed(found, found.exact, found.step, uncertainty) if isinstance(found, Printed) else found
+
+
+def concise(value: float | None, standard_error: float | None, unit: str = "") -> str:
+    """A figure for people, in the concise notation of the GUM (7.2.2):
+    `−2.410 594(24) V/g`, the error to two digits in the last places of the
+    value. Both are taken times a power of a thousand where they are very small
+    or large: `6.255(16) × 10⁻³ rad`. Without an error six digits of the
+    value."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    known = standard_error if standard_error and math.isfinite(standard_error) and standard_error > 0 else 0.0
+    power = _power(max(abs(value), known))
+    value, known = value / 10.0**power, known / 10.0**power
+    if known:
+        last = int(f"{known:.1e}".partition("e")[2]) - 1
+    else:
+        last = math.floor(math.log10(abs(value))) - 5 if value else 0
+    decimals = max(-last, 0)
+    text = _grouped(f"{round(value, -last) + 0.0:.{decimals}f}")
+    if known:
+        digits = round(known, -last)
+        text += f"({digits:.{decimals}f})" if digits >= 1 or not decimals else f"({digits * 10.0**decimals:.0f})"
+    return f"{text}{_times(power)} {unit}".rstrip()
+
+
+def concise_error(value: float | None, unit: str = "") -> str:
+    """An uncertainty for people: two digits."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    power = _power(abs(value))
+    scaled = value / 10.0**power
+    last = int(f"{scaled:.1e}".partition("e")[2]) - 1
+    text = _grouped(f"{round(scaled, -last) + 0.0:.{max(-last, 0)}f}")
+    return f"{text}{_times(power)} {unit}".rstrip()
+
+
+def _power(scale: float) -> int:
+    """Of ten, in threes, by which figures of this size are written."""
+    return 0 if scale == 0.0 or LEAST_PLAIN <= scale < MOST_PLAIN else 3 * math.floor((math.log10(scale) + 1) / 3)
+
+
+def _times(power: int) -> str:
+    return f" × 10{str(power).translate(_SUPERSCRIPT)}" if power else ""
+
+
+def _grouped(number: str) -> str:
+    """Digits in threes from the decimal point either way (ISO 80000-1, 7.3.2),
+    by spaces at which no line breaks."""
+    whole, point, part = number.removeprefix("-").partition(".")
+    head = len(whole) % 3
+    of_whole = [whole[:head]] * bool(head) + [whole[i : i + 3] for i in range(head, len(whole), 3)]
+    of_part = [part[i : i + 3] for i in range(0, len(part), 3)]
+    return "−" * number.startswith("-") + NARROW.join(of_whole) + point + NARROW.join(of_part)
 
 
 def _to_digits(value: float, digits: int) -> Printed:

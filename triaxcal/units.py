@@ -7,10 +7,12 @@ import math
 import re
 from dataclasses import dataclass
 
-from triaxcal.number_format import micro_g, plain
+from triaxcal.number_format import micro_g, plain, three_digits
 
 SMALLEST = 1e-250
 """Of references: beyond it powers of ten end."""
+SMALL = 0.1
+"""Of the small unit: below it two decimals do."""
 UNNAMED = "reference unit"
 """What stands in documents where nobody named the unit of the reference."""
 _MICRO_G = re.compile(r"(?<![\w.])([+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?) µg(?!\w)")
@@ -53,7 +55,12 @@ class ErrorUnit:
         return value / self.whole * 10.0**-self.exponent
 
     def written(self, value: float | None) -> str:
-        return "—" if value is None else f"{self.count(value):.1f}"
+        """To three digits: no error of the magnitude is known better than to
+        some per cent. Less than a hundredth of the unit is nothing."""
+        if value is None:
+            return "—"
+        count = self.count(value)
+        return f"{count:.2f}" if abs(count) < SMALL else three_digits(count)
 
     def in_full(self, value: float | None) -> str:
         return self._behind(self.written(value))

@@ -12,6 +12,7 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import Unexplained
 from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.partial_residuals import Quantity, Trace, unit_of
 from triaxcal.interchange.calibration_document import (
     WEIGHT,
     Document,
@@ -19,11 +20,11 @@ from triaxcal.interchange.calibration_document import (
     coefficients_document,
     residual_document,
 )
-from triaxcal.rounding import chance, error, number
+from triaxcal.rounding import chance, error, known_to, number, numbers, uncertainty
 from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import next_recording
-from triaxcal.units import ErrorUnit
+from triaxcal.units import ErrorUnit, in_units_of
 from triaxcald.choices import choices_of
 from triaxcald.doubts import UNIT
 
@@ -96,7 +97,37 @@ def loop_document(
         **({"doubts": [UNIT]} if unit_in_doubt or loop.found.change_point else {}),
         "data_quality": list(data_quality),
         "advice": list(diagnosis.advice(loop, small)),
+        "notes": list(diagnosis.notes(loop, small)),
+        "traces": [_trace(trace, reference, reference_unit) for trace in loop.traces],
         "calibration": calibration,
+    }
+
+
+def _trace(trace: Trace, reference: float, reference_unit: str) -> Document:
+    in_errors = trace.quantity is Quantity.STANDARD_ERRORS
+    widest = float(trace.half_width.max(initial=0.0))
+
+    def value(v: float, known: float) -> float | None:
+        return uncertainty(v) if in_errors else known_to(v, known, reference)
+
+    return {
+        "effect": trace.effect or None,
+        "axis": trace.axis or None,
+        "coefficients": list(trace.coefficients),
+        "variable": trace.variable,
+        "variable_unit": in_units_of(unit_of(trace.variable), reference_unit),
+        "quantity": trace.quantity.value,
+        "share": uncertainty(trace.share),
+        "pose": trace.pose.tolist(),
+        "x": numbers(trace.x),
+        "y": [value(float(y), float(known)) for y, known in zip(trace.y, trace.error, strict=True)],
+        "error": [uncertainty(float(v)) for v in trace.error],
+        "excluded": trace.excluded.tolist(),
+        "curve": {
+            "x": numbers(trace.grid),
+            "y": [value(float(y), widest) for y in trace.curve],
+            "half_width": [known_to(float(v), widest, reference) for v in trace.half_width],
+        },
     }
 
 

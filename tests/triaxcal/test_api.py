@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.quality.finding import UNTRUSTED
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcal.text import traces as text_of_traces
 
 MINUS = (-1, -1, -1)
 
@@ -311,8 +313,23 @@ def test_a_diagnosis_says_itself_in_a_few_lines(diagnosed: tc.Diagnosis) -> None
     assert lines[0] == "Diagnosis"
     assert lines[1] == f"  {diagnosed.call}"
     assert lines[2].startswith(f"  {diagnosed.findings[0].effect} (")
-    assert lines[3].startswith("  residual rms ")
+    assert lines[3].startswith("  cross-validated rms ")
+    assert lines[3].index("χ² per degree of freedom") < lines[3].index("residual rms")
     assert len(lines) == 5
+
+
+def test_a_diagnosis_is_plotted_without_a_window(diagnosed: tc.Diagnosis, tmp_path: Path) -> None:
+    figure = diagnosed.plot()
+    panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
+    assert [axes.get_title(loc="left") for axes in panels] == [text_of_traces.title(t) for t in diagnosed.traces]
+    (effect,) = {t.effect for t in diagnosed.traces}
+    assert effect == diagnosed.findings[0].effect
+    for axes, trace in zip(panels, diagnosed.traces, strict=True):
+        curve = next(line for line in axes.lines if len(line.get_xdata()) == len(trace.grid))
+        np.testing.assert_allclose(curve.get_ydata(), trace.curve * 1e6)
+        assert axes.get_ylabel().endswith("µg")
+    figure.savefig(tmp_path / "plot.png")
+    assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
 
 
 def test_a_diagnosis_has_what_acts_with_its_probability(diagnosed: tc.Diagnosis) -> None:

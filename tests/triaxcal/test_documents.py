@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -312,7 +313,7 @@ def test_it_shows_itself_in_a_few_lines(calibration: tc.Calibration) -> None:
     assert "26 poses" in shown
     told = calibration.summary()
     assert "bias.z" in told
-    assert "±" in told
+    assert re.search(r"scale_factor\.x +−2\.4[\d\u202f]+\(\d\d\) V/g\n", told)
     assert "<table>" in calibration._repr_html_()
 
 

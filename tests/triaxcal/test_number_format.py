@@ -10,12 +10,12 @@ from triaxcal.number_format import micro_g, number_of, plain, probability
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        (1.1183e-3, "1118.3 µg"),
+        (1.1183e-3, "1118 µg"),
         (15e-6, "15.0 µg"),
         (5.031e-6, "5.03 µg"),
         (2e-13, "2e-07 µg"),
         (0.0, "0 µg"),
-        (-3.2, "-3200000.0 µg"),
+        (-3.2, "-3200000 µg"),
         (None, "unknown"),
     ],
 )
@@ -24,7 +24,7 @@ def test_an_error_has_the_digits_that_tables_have_or_three(value: float | None, 
 
 
 def test_a_sign_is_told_where_it_is_asked_for() -> None:
-    assert micro_g(1.1183e-3, "+") == "+1118.3 µg"
+    assert micro_g(1.1183e-3, "+") == "+1118 µg"
     assert micro_g(5.031e-6, "+") == "+5.03 µg"
 
 

@@ -13,6 +13,8 @@ import pytest
 from triaxcal.rounding import (
     Printed,
     chance,
+    concise,
+    concise_error,
     correlation,
     degrees,
     direction,
@@ -45,6 +47,56 @@ def test_a_figure_is_rounded_to_its_step(made: float, printed: float, step: floa
     assert isinstance(made, Printed)
     assert made == printed
     assert made.step == pytest.approx(step)
+
+
+@pytest.mark.parametrize(
+    ("value", "standard_error", "unit", "text"),
+    [
+        (-2.41059354, 2.4e-5, "V/g", "−2.410 594(24) V/g"),
+        (6.25454406e-3, 1.56e-5, "rad", "6.255(16) × 10⁻³ rad"),
+        (9.80665, 0.0123, "m/s²", "9.807(12) m/s²"),
+        (1234567.891, 0.25, "", "1 234 567.89(25)"),
+        (123456.0, 25.0, "count/g", "123 456(25) count/g"),
+        (123456.0, 2512.0, "count/g", "123 500(2500) count/g"),
+        (12.0, 2.51, "s", "12.0(2.5) s"),
+        (0.12345, 0.0996, "g", "0.12(10) g"),
+        (2.0, 0.999, "s", "2.0(1.0) s"),
+        (3e-7, 1.2e-5, "g", "0(12) × 10⁻⁶ g"),
+        (-4.99e-6, 1.2e-3, "g", "0.0(1.2) × 10⁻³ g"),
+        (4.2e9, 3.1e7, "", "4.200(31) × 10⁹"),
+        (0.0, 0.0, "g", "0 g"),
+        (0.5, None, "g", "0.500 000 g"),
+        (0.5, float("nan"), "g", "0.500 000 g"),
+        (None, 0.1, "g", "—"),
+        (float("inf"), 0.1, "g", "—"),
+    ],
+)
+def test_a_figure_for_people_has_the_digits_that_its_error_leaves(
+    value: float | None, standard_error: float | None, unit: str, text: str
+) -> None:
+    """The concise notation of the GUM, 7.2.2."""
+    assert concise(value, standard_error, unit).replace("\u202f", " ") == text
+
+
+def test_value_and_error_can_be_read_back() -> None:
+    rng = np.random.default_rng(1)
+    values, errors = rng.normal(size=300) * 10 ** rng.uniform(-8, 8, 300), 10 ** rng.uniform(-9, 7, 300)
+    for value, error_of in zip(values, errors, strict=True):
+        text = concise(value, error_of).replace("\u202f", "").replace("−", "-")
+        body, _, power = text.partition(" × 10")
+        exponent = int(power.translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-"))) if power else 0
+        number_of, _, digits = body.removesuffix(")").partition("(")
+        decimals = len(number_of.partition(".")[2])
+        scale = 10.0**exponent if "." in digits or not decimals else 10.0 ** (exponent - decimals)
+        assert float(digits) * scale == pytest.approx(error_of, rel=0.051)
+        assert abs(float(number_of) * 10.0**exponent - value) <= 0.0501 * error_of + 1e-12 * abs(value)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(4.8e-5, "48 × 10⁻⁶ V"), (0.0, "0.0 V"), (123.4, "120 V"), (0.996, "1.0 V"), (None, "—")]
+)
+def test_an_uncertainty_for_people_has_two_digits(value: float | None, text: str) -> None:
+    assert concise_error(value, "V") == text
 
 
 @pytest.mark.parametrize("back", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy])

@@ -33,13 +33,13 @@ def test_a_unit_with_a_fraction_stands_in_brackets() -> None:
 @pytest.mark.parametrize(
     ("unit", "reference", "text", "number"),
     [
-        ("g", 0.998, "µg", "2.0"),
-        ("reference unit", 9.80665, "ppm of the reference", "0.2"),
-        ("reference unit", 5e-5, "ppm of the reference", "40000.0"),
+        ("g", 0.998, "µg", "2.00"),
+        ("reference unit", 9.80665, "ppm of the reference", "0.204"),
+        ("reference unit", 5e-5, "ppm of the reference", "40000"),
         ("reference unit", 1e-320, "ppm of the reference", None),
-        ("µT", 48.0, "1e-6 µT", "2.0"),
-        ("nT", 48_000.0, "1e-3 nT", "0.0"),
-        ("T", 5e-5, "1e-12 T", "2000000.0"),
+        ("µT", 48.0, "1e-6 µT", "2.00"),
+        ("nT", 48_000.0, "1e-3 nT", "0.00"),
+        ("T", 5e-5, "1e-12 T", "2000000"),
         ("T", 1e-320, "1e-258 T", None),
     ],
 )
@@ -66,6 +66,6 @@ def test_a_sentence_has_the_unit_of_the_reference_behind_numbers_alone() -> None
 
 def test_a_power_of_ten_is_written_on_to_its_number() -> None:
     small = ErrorUnit.of("m/s^2", 9.80665)
-    assert [small.in_full(v) for v in (20.06e-6, 0.0, None)] == ["20.1e-6 m/s^2", "0.0e-6 m/s^2", "— 1e-6 m/s^2"]
+    assert [small.in_full(v) for v in (20.06e-6, 0.0, None)] == ["20.1e-6 m/s^2", "0.00e-6 m/s^2", "— 1e-6 m/s^2"]
     assert ErrorUnit.of("g", 1.0).in_full(20.06e-6) == "20.1 µg"
     assert ErrorUnit.of("reference unit", 9.80665).in_full(98.0665e-6) == "10.0 ppm of the reference"

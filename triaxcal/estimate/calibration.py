@@ -33,7 +33,10 @@ class Residual:
     ``noise_floor_g`` is the rms of the standard errors of the pose means along
     the measured vector, from the scatter inside the poses alone;
     ``lack_of_fit_p`` the probability of residuals at least as large as these if the
-    model were complete and that noise were all.
+    model were complete and that noise were all. ``weighted_rms`` is the rms of
+    the residuals over those standard errors, and ``reduced_chi2`` their sum of
+    squares over the degrees of freedom that the model leaves; None where nobody
+    knows them.
     """
 
     rms_g: float
@@ -41,6 +44,8 @@ class Residual:
     cross_validated_rms_g: float | None
     noise_floor_g: float
     lack_of_fit_p: float | None
+    weighted_rms: float | None = None
+    reduced_chi2: float | None = None
 
     @classmethod
     def of(
@@ -50,10 +55,15 @@ class Residual:
         *,
         cross_validated_rms_g: float | None = None,
         lack_of_fit_p: float | None = None,
+        left: float | None = None,
     ) -> Residual:
         """Of the poses that a fit used: ``misses`` (n,) of |a| and the standard
-        errors (n,) of their noise."""
-        return cls(rms(misses), float(np.max(np.abs(misses))), cross_validated_rms_g, rms(noise), lack_of_fit_p)
+        errors (n,) of their noise; ``left`` are the degrees of freedom that the
+        model leaves."""
+        weighted = rms(misses / noise) if (noise > 0).all() else None
+        chi2 = len(misses) * weighted**2 / left if weighted is not None and left is not None and left > 0 else None
+        largest = float(np.max(np.abs(misses)))
+        return cls(rms(misses), largest, cross_validated_rms_g, rms(noise), lack_of_fit_p, weighted, chi2)
 
 
 @dataclass(frozen=True)

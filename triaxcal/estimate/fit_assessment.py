@@ -82,6 +82,7 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
             noise,
             cross_validated_rms_g=cross_validated(problem, state),
             lack_of_fit_p=lack_of_fit_p(found.chi2, found.dof, within_pose_dof(poses)),
+            left=n - p - sum(len(e.shape) for e in state.effects),
         ),
         poses=pose_results(poses, up, r, noise, studentized(r, s, leverage), leverage, total=s * birge_ratio),
         condition=_condition(weighted),

@@ -117,6 +117,7 @@ def _with_known_residuals(
         noise,
         cross_validated_rms_g=rms(own / free[of_used]),
         lack_of_fit_p=lack_of_fit_p(float(np.sum((own / noise) ** 2)), left, pure),
+        left=left,
     )
     return replace(c, residual=residual, poses=results)
 

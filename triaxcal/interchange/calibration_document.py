@@ -59,6 +59,8 @@ def residual_document(residual: Residual, reference: float = 1.0) -> Document:
         "cross_validated_rms_g": error(residual.cross_validated_rms_g, reference),
         "noise_floor_g": error(residual.noise_floor_g, reference),
         "lack_of_fit_p": probability(residual.lack_of_fit_p),
+        "weighted_rms": uncertainty(residual.weighted_rms),
+        "reduced_chi2": uncertainty(residual.reduced_chi2),
     }
 
 

@@ -162,13 +162,13 @@ def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
 def _residual(part: Mapping[str, Any]) -> Residual:
     held = part.get("residual")
     found = held if isinstance(held, Mapping) else {}
-    crossed, p = (number_in(found.get(name)) for name in ("cross_validated_rms_g", "lack_of_fit_p"))
+    optional = ("cross_validated_rms_g", "lack_of_fit_p", "weighted_rms", "reduced_chi2")
+    known = {name: None if math.isnan(v := number_in(found.get(name))) else v for name in optional}
     return Residual(
         rms_g=number_in(found.get("rms_g")),
         max_abs_g=number_in(found.get("max_abs_g")),
-        cross_validated_rms_g=None if math.isnan(crossed) else crossed,
         noise_floor_g=number_in(found.get("noise_floor_g")),
-        lack_of_fit_p=None if math.isnan(p) else p,
+        **known,
     )
 
 

@@ -48,6 +48,11 @@ def to_do(loop: Loop, small: ErrorUnit) -> str:
         # What is not known for certain is in the uncertainty already.
         optional = loop.call is Recommendation.RECORD_MORE
         return f"optional where the limits are kept: {first}" if optional else first
+    return _without_recording(loop)
+
+
+def _without_recording(loop: Loop) -> str:
+    """What to do where no pose is to be recorded."""
     if loop.call is Recommendation.INVESTIGATE:
         return "find out what acts before the calibration is used; no further pose is expected to tell"
     known = all(f.verdict is Verdict.ADOPTED for f in loop.findings) and not loop.candidates
@@ -55,22 +60,27 @@ def to_do(loop: Loop, small: ErrorUnit) -> str:
 
 
 def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
-    """A line each, the most urgent first."""
-    yield from _poses_again(loop)
-    yield from _apart(loop)
-    yield from _next(loop, small)
-    for name, expected in loop.advice.expected.items():
-        yield f"{name}: probability {chance(expected.now)} now, {chance(expected.if_it_acts)} expected then if it acts"
-    for finding in loop.findings:
-        if finding.verdict is Verdict.ADOPTED:
-            yield f"{finding.effect}: {finding.remedy}"
-    if loop.refusal is not None:
-        yield f"no effect is corrected, because {REFUSED[loop.refusal]}"
+    """What to do, an action a line, the most urgent first."""
+    yield from [*_poses_again(loop), *_apart(loop), *_next(loop, small)] or [_without_recording(loop)]
     if loop.held_out is not None and loop.held_out.worse:
         before, after = small.in_full(loop.held_out.before_rms_g), small.in_full(loop.held_out.after_rms_g)
         yield (
-            f"in the check recording the linear calibration is better ({before}, with what was found {after}): "
-            "diagnose both recordings together"
+            "diagnose both recordings together: in the check recording the linear calibration is better "
+            f"({before}, with what was found {after})"
+        )
+    for finding in loop.findings:
+        if finding.verdict is Verdict.ADOPTED:
+            yield f"{finding.effect}: {finding.remedy}"
+
+
+def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:
+    """What else to know, a line each: nothing that anybody has to do."""
+    if loop.refusal is not None:
+        yield f"no effect is corrected, because {REFUSED[loop.refusal]}"
+    for name, expected in loop.advice.expected.items():
+        yield (
+            f"{name}: probability {chance(expected.now)} now, {chance(expected.if_it_acts)} expected after the poses "
+            "that are advised, if it acts"
         )
     reasons = {name: blind(why) for name, why in loop.not_identifiable.items()}
     for reason in dict.fromkeys(reasons.values()):

@@ -3,19 +3,22 @@ how likely, and what is left."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
+from triaxcal.estimate.calibration import Residual
+from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.prior import Odds
+from triaxcal.number_format import plain
 from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
-from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
+from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_do
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
-__all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
+__all__ = ["advice", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]
 
 EVEN = 0.5
 """Probability from which on it is likelier than not that nothing acts."""
@@ -33,13 +36,18 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     and what to do. ``following`` is the next recording where a station knows
     more of the reference than the poses tell."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
-    before, after = (c.residual.rms_g for c in (loop.before, loop.after))
+    acts = cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities, loop.averaged)
     return (
         call(loop.call),
-        cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
-        errors(before, after, following or loop.next_recording, small),
+        acts,
+        errors(loop.before.residual, loop.after.residual, loop.held_out, following or loop.next_recording, small),
         to_do(loop, small),
     )
+
+
+def _each(weights: Mapping[str, float]) -> str:
+    each = ", ".join(f"{name} ({chance(p)})" for name, p in weights.items())
+    return f"what may act, each by its probability: {each}"
 
 
 def call(found: Recommendation) -> str:
@@ -53,15 +61,22 @@ def cause(
     began: Mapping[int, PoseStart],
     small: ErrorUnit,
     probabilities: Mapping[str, float],
+    weights: Mapping[str, float] | None = None,
 ) -> str:
     """What acts, each with its probability; ``began`` says when the poses
     began, by their place. ``probabilities`` are those of all effects, the
-    likeliest first."""
+    likeliest first, and ``weights`` those of effects that are corrected as far
+    as they are probable, and named nowhere else."""
     said = [*_causes(found, findings, candidates, began, small)]
-    if said:
-        return "; ".join(said)
+    also = " also" if findings or candidates else ""
+    mean = [f"the correction{also} averages over {_each(weights)}"] if weights else []
+    return "; ".join([*(said or [_nothing_named(found, probabilities, weights)]), *mean])
+
+
+def _nothing_named(found: Findings, probabilities: Mapping[str, float], weights: Mapping[str, float] | None) -> str:
     if found.nothing >= EVEN:
-        return f"no effect shows (nothing acts with probability {chance(found.nothing)})"
+        shows = "is likely" if weights else "shows"
+        return f"no effect {shows} (nothing acts with probability {chance(found.nothing)})"
     likely = [f"{name} ({chance(p)})" for name, p in probabilities.items()][:LIKELIEST]
     none = f"something that no effect describes ({chance(found.unexplained.probability)})"
     return f"something acts, and these poses do not tell what; the likeliest are {', '.join(likely)}; or {none}"
@@ -120,11 +135,30 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     return said
 
 
-def errors(before_rms: float, after_rms: float, following: NextRecording, small: ErrorUnit) -> str:
-    """The residual before and after, and what to expect of the next recording."""
+def errors(before: Residual, after: Residual, held: HoldOut | None, following: NextRecording, small: ErrorUnit) -> str:
+    """The errors before and after, what tells most first, and what to expect of
+    the next recording."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
     start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
-    return (
-        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; expanded uncertainty in "
-        f"the next recording {within} ({start} from start to start, {how})"
-    )
+    said = []
+    if held is not None:
+        said.append(f"held-out rms {_pair(small.in_full, held.before_rms_g, held.after_rms_g)}")
+    if before.cross_validated_rms_g is not None and after.cross_validated_rms_g is not None:
+        crossed = _pair(small.in_full, before.cross_validated_rms_g, after.cross_validated_rms_g)
+        said.append(f"cross-validated rms {crossed}")
+    if before.weighted_rms is not None and after.weighted_rms is not None:
+        said.append(f"residuals in standard errors, rms, {_pair(_ratio, before.weighted_rms, after.weighted_rms)}")
+    if before.reduced_chi2 is not None and after.reduced_chi2 is not None:
+        said.append(f"χ² per degree of freedom {_pair(_ratio, before.reduced_chi2, after.reduced_chi2)}")
+    said.append(f"residual rms {_pair(small.in_full, before.rms_g, after.rms_g)}")
+    said.append(f"expanded uncertainty in the next recording {within} ({start} from start to start, {how})")
+    return "; ".join(said)
+
+
+def _pair(text: Callable[[float], str], before: float, after: float) -> str:
+    """Before and after; once where nothing is corrected."""
+    return text(before) if before == after else f"{text(before)} before, {text(after)} after"
+
+
+def _ratio(value: float) -> str:
+    return plain(value, 2)

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import html as markup
 import math
-from collections.abc import Iterable, Sequence
-
-import numpy as np
+from collections.abc import Iterable, Iterator, Sequence
 
 from triaxcal.effects.contract import SINCE_START, TIME
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.number_format import number_of
+from triaxcal.estimate.calibration import Calibration, Residual
+from triaxcal.number_format import number_of, plain
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import concise
 from triaxcal.text.holds import holds
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 
 def short(c: Calibration, output_unit: str, reference_unit: str) -> str:
     """The model, its coefficients and its residual."""
-    rows = [f"{name:<14}{value} {unit}" for name, value, unit in _linear(c, output_unit, reference_unit)]
+    rows = [f"{name:<14}{value}" for name, value in _linear(c, output_unit, reference_unit)]
     return "\n".join([f"Calibration: {', '.join(c.terms)}", *(f"  {r}" for r in (*rows, *_quality(c, reference_unit)))])
 
 
@@ -26,10 +25,7 @@ def summary(c: Calibration, output_unit: str, reference_unit: str, warnings: Ite
     """The same with the effects' coefficients, all standard errors, and the
     warnings."""
     lines = [f"Calibration: {', '.join(c.terms)}"]
-    lines += [
-        f"  {name:<34}{value:>+16.9g} {error:<14} {unit}"
-        for name, value, error, unit in _all(c, output_unit, reference_unit)
-    ]
+    lines += [f"  {name:<34}{figure}" for name, figure in _all(c, output_unit, reference_unit)]
     lines += [f"  {line}" for line in _quality(c, reference_unit)]
     lines += [f"  warning: {line}" for line in warnings]
     return "\n".join(lines)
@@ -63,44 +59,54 @@ def verification(poses: str, rms: float, noise_floor: float, expected: float, re
 def html(c: Calibration, output_unit: str, reference_unit: str, warnings: Iterable[str]) -> str:
     """The same as a table for a notebook."""
     rows = "".join(
-        f"<tr><td>{markup.escape(name)}</td><td>{value:+.9g}</td><td>{error}</td><td>{markup.escape(unit)}</td></tr>"
-        for name, value, error, unit in _all(c, output_unit, reference_unit)
+        f"<tr><td>{markup.escape(name)}</td><td>{markup.escape(figure)}</td></tr>"
+        for name, figure in _all(c, output_unit, reference_unit)
     )
     lines = [*_quality(c, reference_unit), *(f"warning: {w}" for w in warnings)]
     below = "".join(f"<li>{markup.escape(line)}</li>" for line in lines)
     return f"<p>Calibration: {markup.escape(', '.join(c.terms))}</p><table>{rows}</table><ul>{below}</ul>"
 
 
-def _linear(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[str, str, str]]:
-    s, output = c.sensor, output_unit or "output"
-    return [
-        ("scale factor", _vector(s.scale_factor), f"{output}/{grouped(reference_unit)}"),
-        ("misalignment", _vector(s.misalignment), "rad"),
-        ("bias", _vector(s.bias), reference_unit),
-    ]
+def _units(output_unit: str, reference_unit: str) -> dict[str, str]:
+    scale_factor = f"{output_unit or 'output'}/{grouped(reference_unit)}"
+    return {"scale factor": scale_factor, "misalignment": "rad", "bias": reference_unit}
 
 
-def _all(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[str, float, str, str]]:
-    """Name, value, standard error and unit of every coefficient, and of the
-    effects' shapes."""
-    units = [unit for _, _, unit in _linear(c, output_unit, reference_unit) for _ in "xyz"]
+def _linear(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[str, str]]:
+    figures = [figure for _, figure in _all(c, output_unit, reference_unit)]
+    names = _units(output_unit, reference_unit)
+    return [(name, "  ".join(figures[3 * k : 3 * k + 3])) for k, name in enumerate(names)]
+
+
+def _all(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[str, str]]:
+    """Name and figure of every coefficient, and of the effects' shapes."""
+    units = [unit for unit in _units(output_unit, reference_unit).values() for _ in "xyz"]
     found = [
-        (name, float(value), _error(float(error)), unit)
+        (name, concise(float(value), float(error), unit))
         for name, value, error, unit in zip(c.parameters[:9], c.values[:9], c.standard_errors[:9], units, strict=True)
     ]
     for effect, _ in c.sensor.effects:
         for name, (value, error, unit) in c.coefficients_of(effect.name).items():
-            found.append((f"{effect.name}.{name}", value, _error(error), in_units_of(unit, reference_unit)))
+            found.append((f"{effect.name}.{name}", concise(value, error, in_units_of(unit, reference_unit))))
     return found
+
+
+def _errors(r: Residual, small: ErrorUnit) -> Iterator[str]:
+    """What tells most first."""
+    if r.cross_validated_rms_g is not None:
+        yield f"cross-validated rms {small.in_full(r.cross_validated_rms_g)}"
+    if r.weighted_rms is not None:
+        chi2 = "" if r.reduced_chi2 is None else f" (χ² per degree of freedom {plain(r.reduced_chi2, 2)})"
+        yield f"residuals of {plain(r.weighted_rms, 2)} standard errors rms{chi2}"
+    yield f"residual rms {small.in_full(r.rms_g)}"
+    yield f"noise floor {small.in_full(r.noise_floor_g)}"
 
 
 def _quality(c: Calibration, reference_unit: str) -> list[str]:
     small, r = ErrorUnit.of(reference_unit, c.reference), c.residual
     lines = []
     if not math.isnan(r.rms_g):
-        crossed = r.cross_validated_rms_g
-        beside = "" if crossed is None else f", cross-validated {small.in_full(crossed)}"
-        lines.append(f"residual rms {small.in_full(r.rms_g)}{beside}, noise floor {small.in_full(r.noise_floor_g)}")
+        lines.append(", ".join(_errors(r, small)))
     if c.poses:
         excluded = sum(not p.used for p in c.poses)
         lines.append(number_of(len(c.poses), "pose") + (f", {excluded} of them excluded" if excluded else ""))
@@ -111,11 +117,3 @@ def _quality(c: Calibration, reference_unit: str) -> list[str]:
     if c.holds_at is not None and any({TIME, SINCE_START} & set(e.needs) for e, _ in c.sensor.effects):
         lines.append(f"effects of time hold at {c.holds_at.t_s:.1f} s of its recording ({c.holds_at.moment.value})")
     return lines
-
-
-def _vector(values: Sequence[float] | np.ndarray) -> str:
-    return "[" + "  ".join(f"{v:+.7g}" for v in values) + "]"
-
-
-def _error(value: float | None) -> str:
-    return "" if value is None or math.isnan(value) else f"± {value:.2g}"

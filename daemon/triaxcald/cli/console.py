@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from triaxcal.units import ErrorUnit
 from triaxcald.abort import add_action, discard_action, steer
 from triaxcald.printable import printable, printable_json
 from triaxcald.text import waits
@@ -98,7 +99,7 @@ class _Output(Console):
 
 def micro(value: float | None) -> str:
     """A number of g in µg."""
-    return "—" if value is None else f"{value * 1e6:.1f}"
+    return ErrorUnit().written(value)
 
 
 class _Shown(Console):

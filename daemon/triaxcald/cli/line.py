@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from triaxcal import text as of_metrology
 from triaxcal.evidence.prior import Odds
 from triaxcal.number_format import number_of
-from triaxcal.rounding import number
+from triaxcal.rounding import concise, number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
 from triaxcal_drivers.extras import absent
@@ -106,8 +106,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     c, v = o.certified.calibration, o.verification
     b, f = o.certified.before, c.residual
     rows: list[Sequence[Any]] = [
-        ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
         ["fit: cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g), ""],
+        ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
     ]
     if v:
         rows.append(
@@ -130,8 +130,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     for effect in likely:
         show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(weights[effect.name])})")
         for name, (value, error, unit) in c.coefficients_of(effect.name).items():
-            told = unit if error is None else f"± {error:.1g} {unit}"
-            show(f"    {name} {value:+.4g} {told}")
+            show(f"    {name} {concise(value, error, unit)}")
     if o.provisioned:
         show(f"  {text.provisioned(o.provisioned)}")
     if o.settling and o.error is None:

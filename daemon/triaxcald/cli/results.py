@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from triaxcal import text
 from triaxcal.diagnosis import Loop
 from triaxcal.effects import TEMPERATURE
-from triaxcal.estimate.calibration import Calibration, Residual
+from triaxcal.estimate.calibration import Calibration, PoseResult, Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.interchange.calibration_document import assumed_in, holds_of
-from triaxcal.number_format import probability
+from triaxcal.number_format import number_of, plain, probability
+from triaxcal.rounding import concise, concise_error
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcal.units import ErrorUnit, grouped, in_units_of
@@ -33,7 +34,7 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
     r, small = c.residual, choice.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
     show(
-        f"{poses}: residual rms {small.in_full(r.rms_g)}, {cross_validated(r, small)}, noise floor "
+        f"{poses}: {cross_validated(r, small)}, {weighted(r)}residual rms {small.in_full(r.rms_g)}, noise floor "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
     show_budget(b, choice)
@@ -43,6 +44,13 @@ def cross_validated(r: Residual, small: ErrorUnit) -> str:
     if r.cross_validated_rms_g is None:
         return "not cross-validated (without one of the poses the others carry no fit)"
     return f"cross-validated {small.in_full(r.cross_validated_rms_g)}"
+
+
+def weighted(r: Residual) -> str:
+    if r.weighted_rms is None:
+        return ""
+    chi2 = "" if r.reduced_chi2 is None else f" (χ² per degree of freedom {plain(r.reduced_chi2, 2)})"
+    return f"residuals of {plain(r.weighted_rms, 2)} standard errors rms{chi2}, "
 
 
 def temperature_of(c: Calibration) -> str:
@@ -72,16 +80,15 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
     units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
     of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
     for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
-        expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
         of = of_effects.get(name, units.get(name.split(".")[0], ""))
-        rows.append([name, f"{value:.9g}", f"{error:.2g}", *expanded, of])
+        expanded = [f"± {concise_error(whole.expanded[i], of)}"] if whole else []
+        rows.append([name, concise(float(value), float(error), of), *expanded])
     for effect, _ in c.sensor.effects:
         for name in effect.shape:
             value, known, of = c.coefficients_of(effect.name)[name]
-            told = "—" if known is None else f"{known:.2g}"
-            rows.append([f"{effect.name}.{name}", f"{value:.6g}", told, *(["—"] if whole else []), of])
+            rows.append([f"{effect.name}.{name}", concise(value, known, of), *(["—"] if whole else [])])
     expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
-    table("coefficients", ["", "value", "standard error", *expanded_at, "unit"], rows)
+    table("coefficients", ["", "value (standard error)", *expanded_at], rows)
     if held := holds_of(c):
         show(f"scale factor, misalignment and bias hold {'; '.join(held)}")
 
@@ -124,22 +131,47 @@ def text_of_held_out(held: HoldOut, small: ErrorUnit) -> str:
 
 def show_loop(loop: Loop, choice: Choice) -> None:
     """Errors, what acts with which probability, and the advice in full."""
-    b, f, small = loop.before.residual, loop.after.residual, choice.small
-    rows = [
-        ["residual rms", small.written(b.rms_g), small.written(f.rms_g)],
-        ["cross-validated rms", small.written(b.cross_validated_rms_g), small.written(f.cross_validated_rms_g)],
-    ]
-    if loop.held_out:
-        rows.append(
-            ["held-out rms", small.written(loop.held_out.before_rms_g), small.written(loop.held_out.after_rms_g)]
-        )
-    rows.append(["noise floor", small.written(b.noise_floor_g), small.written(f.noise_floor_g)])
-    table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
+    show_before_after(loop, choice.small)
     likely = [[name, diagnosis.chance(p)] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", diagnosis.chance(loop.found.nothing)]]
     rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
     table("what acts", ["", "probability"], [*likely, *rest])
     for finding in loop.findings:
         show(f"{finding.verdict}: {finding.effect} ({diagnosis.reason(finding, loop.refusal)})")
-    for line in diagnosis.advice(loop, small):
-        show(f"advice: {line}")
+    for line in diagnosis.advice(loop, choice.small):
+        show(f"to do: {line}")
+    for line in diagnosis.notes(loop, choice.small):
+        show(f"note: {line}")
+
+
+def show_before_after(loop: Loop, small: ErrorUnit) -> None:
+    """Errors before and after, over the same poses, what tells most first; and
+    the excluded poses with their residuals."""
+    both = loop.before.residual, loop.after.residual
+    used = sum(p.used for p in loop.after.poses)
+    rows = []
+    if loop.held_out:
+        held = loop.held_out.before_rms_g, loop.held_out.after_rms_g
+        rows.append([f"held-out rms, {small}", *map(small.written, held)])
+    rows += [
+        [f"cross-validated rms, {small}", *(small.written(r.cross_validated_rms_g) for r in both)],
+        ["residuals, standard errors rms", *(_ratio(r.weighted_rms) for r in both)],
+        ["χ² per degree of freedom", *(_ratio(r.reduced_chi2) for r in both)],
+        [f"residual rms, {small}", *(small.written(r.rms_g) for r in both)],
+        [f"noise floor, {small}", *(small.written(r.noise_floor_g) for r in both)],
+    ]
+    table(f"error of the magnitude in the {number_of(used, 'pose')} of the fit", ["", "before", "after"], rows)
+    pairs = zip(loop.before.poses, loop.after.poses, strict=True)
+    excluded = [[*_of_pose(before, after, small)] for before, after in pairs if not after.used]
+    if excluded:
+        table(f"excluded poses: residual, {small}", ["begins at", "before", "after", "why"], excluded)
+
+
+def _of_pose(before: PoseResult, after: PoseResult, small: ErrorUnit) -> Iterator[str]:
+    yield f"{after.pose.start_s:.1f} s"
+    yield from (small.written(p.residual_g) if math.isfinite(p.residual_g) else "—" for p in (before, after))
+    yield after.pose.fault or str(after.excluded)
+
+
+def _ratio(value: float | None) -> str:
+    return "—" if value is None else plain(value, 2)

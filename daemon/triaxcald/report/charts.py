@@ -49,29 +49,31 @@ def bars_picture(stages: Sequence[Stage], held_out: HoldOut | None, unit: ErrorU
         if handles[0]:
             figure.legend(*handles, loc="outside upper right")
 
-    return draw("bars", f"Bars. {'; '.join(told)}", (8.0, 0.9 + 0.27 * rows), paint)
+    return draw("bars", f"Bars. {'; '.join(told)}", (4.8, 0.9 + 0.27 * rows), paint)
 
 
-def stream_picture(stream: StreamOverview) -> Markup | None:
-    """The three raw outputs with the still spans shaded, or None for an empty
+def stream_pictures(stream: StreamOverview) -> tuple[Markup, ...]:
+    """The three raw outputs with the still spans shaded; none for an empty
     stream."""
     if stream.time_s.size == 0:
-        return None
-    alt = f"Raw outputs x, y and z over time with {len(stream.spans)} still spans shaded"
+        return ()
+    return tuple(_of_output(stream, axis) for axis in range(3))
 
+
+def _of_output(stream: StreamOverview, axis: int) -> Markup:
     def paint(figure: Figure) -> None:
-        panels = figure.subplots(3, 1, sharex=True)
+        axes = figure.subplots()
         spans = [(start, end - start) for start, end in stream.spans]
-        for axes, name, colour, column in zip(panels, "xyz", AXES, stream.readings.T, strict=True):
-            axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), facecolor=BAND)
-            axes.plot(stream.time_s, column, color=colour, lw=0.8)
-            unit = clean(stream.unit)[:16]
-            axes.set_ylabel(f"u{name}, {unit}" if unit else f"u{name}")
-            axes.yaxis.set_major_locator(MaxNLocator(4))
-            hang_grid(axes)
-        panels[-1].set_xlabel("time, s (shaded: still spans)")
+        axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), facecolor=BAND)
+        axes.plot(stream.time_s, stream.readings[:, axis], color=AXES[axis], lw=0.8)
+        unit = clean(stream.unit)[:16]
+        axes.set_ylabel(f"u{'xyz'[axis]}, {unit}" if unit else f"u{'xyz'[axis]}")
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.set_xlabel("time, s")
+        hang_grid(axes)
 
-    return draw("streams", alt, (8.0, 4.0), paint)
+    alt = f"Raw output {'xyz'[axis]} over time with {len(stream.spans)} still spans shaded"
+    return draw(f"stream{axis}", alt, (4.2, 2.2), paint)
 
 
 def _bar_groups(stages: Sequence[Stage], held_out: HoldOut | None) -> list[Group]:

@@ -15,6 +15,7 @@ import numpy as np
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.evidence.prior import Odds
 from triaxcal.interchange.calibration_document import WEIGHT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
@@ -26,6 +27,9 @@ _OF_A_POSE = (
 )  # fmt: skip
 
 
+AXES = 3
+EVEN = 0.5
+"""Below this probability of nothing something acts, whatever that is."""
 CANDIDATE = "candidate"
 """The verdict on an effect that probably acts; documents have it under
 ``candidates``."""
@@ -59,6 +63,7 @@ class Pose:
     leverage: float | None
     used: bool
     again: bool = False
+    why: str = ""
     standard_error_g: float | None = None
     recording: str = ""
     channels: Mapping[str, float | None] = field(default_factory=dict)
@@ -116,16 +121,19 @@ class Outcome:
 
     refused: str | None
     searched: bool
+    call: str
     stages: tuple[Stage, ...]
     held_out: HoldOut | None
     findings: tuple[Finding, ...]
     unexplained: Unexplained | None
     nothing_probability: float | None
+    another_unit: bool
     not_corrected: str
     linear: tuple[Coefficient, ...]
     effects: tuple[tuple[str, tuple[Coefficient, ...]], ...]
     matrix: tuple[Vector, ...] | None
     centre: Vector | None
+    averaged: Mapping[str, float | None]
     use: str
     output_unit: str
     reference_unit: str
@@ -139,6 +147,7 @@ class Outcome:
     doubts: tuple[str, ...]
     data_quality: tuple[str, ...]
     advice: tuple[str, ...]
+    notes: tuple[str, ...]
     limits: Mapping[str, float | None]
     channel_reference: Mapping[str, float | None]
 
@@ -153,14 +162,32 @@ class Outcome:
 
     @property
     def mean_decimals(self) -> int:
-        """Of the poses' means, so that the largest has eight digits: a few
-        hundredths of a millionth of 1 g."""
+        """Of the poses' means: to two digits of the smallest standard error; where
+        none is known, so that the largest has eight digits."""
+        scale = min((abs(c.value) for c in self.linear[:AXES] if c.value), default=0.0)
+        least = scale * min((p.standard_error_g for p in self.poses if p.standard_error_g), default=0.0)
+        if least > 0:
+            return int(np.clip(1 - np.floor(np.log10(least)), 0, 12))
         largest = max((abs(v) for pose in self.poses if pose.mean for v in pose.mean), default=0.0)
         return int(np.clip(7 - np.floor(np.log10(largest)), 0, 12)) if largest else 0
 
     @property
     def poses_used(self) -> int:
         return sum(pose.used for pose in self.poses)
+
+    @property
+    def excluded(self) -> tuple[Pose, ...]:
+        return tuple(pose for pose in self.poses if not pose.used)
+
+    @property
+    def something_is_left(self) -> bool:
+        """Whether it is likelier than not that something acts beside the outliers
+        that are excluded, or more is left than noise accounts for."""
+        p, nothing = self.final.lack_of_fit_p, self.nothing_probability
+        unexplained = self.unexplained is not None and self.unexplained.significant
+        outliers = any(pose.again for pose in self.poses)
+        something = nothing is not None and nothing < EVEN and not outliers
+        return unexplained or something or (p is not None and p < LACK_OF_FIT)
 
 
 def read_document(document: Mapping[str, object]) -> Outcome:
@@ -180,6 +207,7 @@ def read_document(document: Mapping[str, object]) -> Outcome:
     return Outcome(
         refused=_refusal(document, calibration),
         searched=looped,
+        call=str(document.get("call") or ""),
         stages=stages_of(document, calibration, (before_g, after_g), held_out),
         held_out=held_out,
         findings=(
@@ -188,11 +216,13 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         ),
         unexplained=_unexplained(document.get("unexplained")),
         nothing_probability=number(document.get("nothing_probability")),
+        another_unit=bool(mapping(document.get("another_unit"))),
         not_corrected=str(document.get("not_corrected") or ""),
         linear=tuple(_linear(calibration, units)),
         effects=tuple((name, _coefficients(values)) for name, values in effects.items()),
         matrix=matrix,
         centre=centre,
+        averaged=_averaged(document, effects),
         use=str(calibration.get("use") or ""),
         output_unit=_output_unit(units),
         reference_unit=clean(mapping(units).get("reference") or "g"),
@@ -206,9 +236,23 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         doubts=texts(document.get("doubts")),
         data_quality=tuple(_with_names(line, names) for line in texts(document.get("data_quality"))),
         advice=texts(document.get("advice")),
+        notes=texts(document.get("notes")),
         limits=numbers(document.get("limits")),
         channel_reference=numbers(calibration.get("channel_reference")),
     )
+
+
+def _averaged(document: Mapping[str, object], effects: Mapping[str, object]) -> dict[str, float | None]:
+    """Effects that the correction has by as much as they are probable, and that
+    are neither findings nor candidates: each with its probability."""
+    listed = (entry for key in ("findings", "candidates") for entry in _entries(document.get(key)))
+    named = {name for entry in listed for name in (str(entry.get("effect")), *texts(entry.get("alternatives")))}
+    weights = {name: mapping(values).get(WEIGHT) for name, values in effects.items()}
+    return {name: number(weight) for name, weight in weights.items() if name not in named and weight is not None}
+
+
+def _entries(value: object) -> list[Mapping[str, object]]:
+    return [mapping(entry) for entry in value] if isinstance(value, (list, tuple)) else []
 
 
 def _with_names(line: str, names: Mapping[str, str]) -> str:
@@ -252,8 +296,7 @@ def _unexplained(value: object) -> Unexplained | None:
 
 def _findings(value: object, terms: set[str], verdict: str = "") -> Iterator[Finding]:
     """``verdict`` is that of entries which have none."""
-    for entry in value if isinstance(value, (list, tuple)) else []:
-        known = mapping(entry)
+    for known in _entries(value):
         effect = str(known.get("effect", ""))
         reason, remedy = known.get("reason"), known.get("remedy")
         yield Finding(
@@ -307,11 +350,17 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
+            why="" if known.get("used") is None or known["used"] else _why(known),
             again=known.get("used") is False and (known.get("excluded") or known.get("left_out")) not in _NOT_AGAIN,
             recording=recordings.get(str(known.get("recording")), ""),
             channels=numbers(known.get("channels")),
             **{name: number(known.get(name)) for name in _OF_A_POSE},
         )
+
+
+def _why(known: Mapping[str, object]) -> str:
+    """Why a pose is excluded, in words."""
+    return str(known.get("left_out") or known.get("excluded") or "").replace("spoiled", "outlier").replace("_", " ")
 
 
 def _direction(mean: Vector | None, matrix: tuple[Vector, ...] | None, centre: Vector | None) -> Vector | None:

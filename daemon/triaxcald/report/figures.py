@@ -3,15 +3,15 @@ missing is an em dash."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from triaxcal.rounding import MISSING as MISSING
+from triaxcal.rounding import NARROW, concise, concise_error
 from triaxcal.text import advice as text
+from triaxcal.text.traces import effect_title as effect_title
 from triaxcal.units import ErrorUnit
 
 MICRO_G = ErrorUnit()
-MISSING = "—"
 _LARGEST = 1e30
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -27,15 +27,8 @@ def number(value: object) -> float | None:
 def clean(value: object) -> str:
     """Text from data without characters that print as nothing or reorder their
     neighbours."""
-    text = "".join(c if c.isprintable() else " " if c.isspace() else "\ufffd" for c in str(value))
-    return " ".join(text.split())
-
-
-def effect_title(effect: str) -> str:
-    """`channel_bias:supply_v` becomes `Channel bias: supply_v`."""
-    name, _, channel = effect.partition(":")
-    title = name.replace("_order_", "-order ").replace("_", " ").capitalize()
-    return f"{title}: {channel}" if channel else title
+    shown = "".join(c if c.isprintable() or c == NARROW else " " if c.isspace() else "\ufffd" for c in str(value))
+    return " ".join(part for part in shown.split(" ") if part)
 
 
 def fixed(value: float | None, decimals: int) -> str:
@@ -110,18 +103,17 @@ def chance(p: float | None) -> str:
 
 
 def plus_minus(value: float | None, standard_error: float | None, unit: str) -> str:
-    """`(6.254 ± 0.016) × 10⁻³ rad`: the error to two digits, the value to the
-    same place."""
-    if value is None:
-        return MISSING
-    unit = unit_text(unit)
-    scale = max(abs(value), standard_error or 0.0)
-    exponent = 0 if scale == 0.0 or 0.1 <= scale < 1e7 else 3 * math.floor((math.log10(scale) + 1) / 3)
-    tail = f" × {power(exponent)}" if exponent else ""
-    scaled = value / 10.0**exponent
-    if not standard_error or standard_error < 0.0:
-        return f"{digits(scaled, 6)}{tail} {unit} ± {MISSING}".replace("  ", " ")
-    scaled_error = standard_error / 10.0**exponent
-    decimals = min(12, max(0, 1 - math.floor(math.log10(scaled_error))))
-    body = f"{fixed(scaled, decimals)} ± {fixed(scaled_error, decimals)}"
-    return (f"({body}){tail} {unit}" if tail else f"{body} {unit}").strip()
+    """A coefficient to the place of its standard error; one whose error is not
+    known says so."""
+    known = standard_error is not None and standard_error > 0
+    return concise(value, standard_error, unit_text(unit)) + ("" if known or value is None else f" ± {MISSING}")
+
+
+def expanded(value: float | None) -> str:
+    """An expanded uncertainty."""
+    return MISSING if value is None else f"± {concise_error(value)}"
+
+
+def ratio(value: float | None) -> str:
+    """What is known to some per cent: a number of standard errors, or of noise."""
+    return MISSING if value is None else digits(value, 2)

@@ -21,11 +21,11 @@ from triaxcald.report.stages import Stage
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8
-_NOTE_SIZE = (0.14, 0.16)
+_NOTE_SIZE = (0.24, 0.12)
 """Width and height of a note beside a pose, in those of the panel."""
 _MOST_CHANNELS = 4
 _MOST_BARS = 120
-_FIGURE_IN, _PANEL_IN = (8.0, 0.9), 1.35
+_PANEL_IN = (4.8, 2.4)
 
 
 def time_pictures(
@@ -35,13 +35,13 @@ def time_pictures(
     *,
     moments_in: Callable[[str], Mapping[str, float]],
     unit: ErrorUnit,
-) -> list[tuple[str, Markup]]:
-    """One a recording, each by its own clock, with the recording's name;
+) -> list[tuple[str, tuple[Markup, ...]]]:
+    """Those of each recording, by its own clock, with the recording's name;
     ``moments_in`` it are marked."""
-    pictures: list[tuple[str, Markup]] = []
+    pictures: list[tuple[str, tuple[Markup, ...]]] = []
     for recording in dict.fromkeys(pose.recording for pose in poses):
         rows = np.array([pose.recording == recording for pose in poses])
-        drawing = time_picture(
+        drawings = time_panels(
             [pose for pose in poses if pose.recording == recording],
             [_in_rows(stage, rows) for stage in stages],
             noise_floor_g,
@@ -49,8 +49,8 @@ def time_pictures(
             unit=unit,
             name=f"time{len(pictures) or ''}",
         )
-        if drawing is not None:
-            pictures.append((recording, drawing))
+        if drawings:
+            pictures.append((recording, drawings))
     return pictures
 
 
@@ -60,7 +60,7 @@ def _in_rows(stage: Stage, rows: NDArray[np.bool_]) -> Stage:
     return replace(stage, pose_residual_g=residual_g if known else None)
 
 
-def time_picture(
+def time_panels(
     poses: Sequence[Pose],
     stages: Sequence[Stage],
     noise_floor_g: float | None,
@@ -68,43 +68,55 @@ def time_picture(
     moments: Mapping[str, float] | None = None,
     unit: ErrorUnit = MICRO_G,
     name: str = "time",
-) -> Markup | None:
+) -> tuple[Markup, ...]:
     """A panel a stage, each on its own scale, and one for each logged channel
     that moved; ``moments`` are marked. All poses are of one recording."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown:
-        return None
+        return ()
     place, label = _places(poses)
-    logged = _moving_channels(poses)
+    marked = moments if "time" in label else None
     of = f" of {clean(poses[0].recording)}" if poses[0].recording else ""
-    alt = f"Residual of {len(poses)} poses{of} in order of time, {' and '.join(s.label.lower() for s in shown)}"
-    if logged:
-        alt += f", above {', '.join(clean(channel) for channel in logged)}"
-    rows = len(shown) + len(logged)
+    colours = stage_colours(stages)
 
-    def paint(figure: Figure) -> None:
-        panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
-        colours = stage_colours(stages)
-        for axes, stage in zip(panels, shown, strict=False):
-            _noise_band(axes, noise_floor_g, unit)
-            _residuals(axes, place, poses, stage, colours[stage.label], unit)
-            axes.set_title(stage.label, loc="left", weight="bold")
-            axes.set_ylabel(f"residual, {unit_label(unit)}")
-        _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1], unit)
-        for axes, (channel, values) in zip(panels[len(shown) :], logged.items(), strict=True):
-            axes.plot(place, values, "s-", color=MUTED, ms=3, lw=0.8)
-            axes.set_title(f"Channel {clean(channel)[:40]}, mean of each pose", loc="left")
-        for axes in panels:
-            _mark_moments(axes, moments if "time" in label else None, named=axes is panels[0])
+    def panel(title: str, alt: str, number: int, fill: Callable[[Axes], None]) -> Markup:
+        def paint(figure: Figure) -> None:
+            axes = figure.subplots()
+            fill(axes)
+            axes.set_title(title, loc="left", weight="bold", pad=14 if marked else None)
+            axes.set_xlabel(label)
+            _mark_moments(axes, marked)
             axes.yaxis.set_major_locator(MaxNLocator(4))
             axes.ticklabel_format(axis="y", useOffset=False)
             hang_grid(axes)
-        panels[-1].set_xlabel(label)
-        handles = panels[0].get_legend_handles_labels()
-        if handles[0]:
-            figure.legend(*handles, loc="outside upper right", ncols=3)
 
-    return draw(name, alt, (_FIGURE_IN[0], _FIGURE_IN[1] + _PANEL_IN * rows), paint)
+        return draw(f"{name}-{number}", alt, _PANEL_IN, paint)
+
+    def of_stage(stage: Stage) -> Callable[[Axes], None]:
+        def fill(axes: Axes) -> None:
+            _noise_band(axes, noise_floor_g, unit)
+            _residuals(axes, place, poses, stage, colours[stage.label], unit)
+            axes.set_ylabel(f"residual, {unit_label(unit)}")
+            if stage is shown[-1]:
+                _mark_conspicuous(axes, place, poses, stage, unit)
+
+        return fill
+
+    def of_channel(values: NDArray[np.float64]) -> Callable[[Axes], None]:
+        def fill(axes: Axes) -> None:
+            axes.plot(place, values, "s-", color=MUTED, ms=3, lw=0.8)
+
+        return fill
+
+    panels = [
+        (stage.label, f"Residual of {len(poses)} poses{of} in order of time, {stage.label.lower()}", of_stage(stage))
+        for stage in shown
+    ]
+    panels += [
+        (f"Channel {clean(channel)[:40]}, mean of each pose", f"Channel {clean(channel)}{of}", of_channel(values))
+        for channel, values in _moving_channels(poses).items()
+    ]
+    return tuple(panel(title, alt, number, fill) for number, (title, alt, fill) in enumerate(panels))
 
 
 def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
@@ -159,7 +171,7 @@ def _residuals(
         axes.vlines(place, residual - half, residual + half, color=colour, lw=0.9)
     axes.plot(place[used], residual[used], "o-", color=colour, ms=size, lw=0.6)
     axes.plot(place[~used], residual[~used], "x", color=colour, ms=size + 2.0, mew=1.6)
-    if (~used).any() and used.any():
+    if (~used).any() and np.isfinite(residual[used]).any():
         _keep_used_in_sight(axes, residual, used)
 
 
@@ -176,13 +188,12 @@ def _keep_used_in_sight(axes: Axes, residual: NDArray[np.float64], used: NDArray
             axes.plot([x], [np.sign(y) * 0.93 * reach], "^" if y > 0 else "v", color=FLOOR, ms=6)
 
 
-def _mark_moments(axes: Axes, moments: Mapping[str, float] | None, *, named: bool) -> None:
+def _mark_moments(axes: Axes, moments: Mapping[str, float] | None) -> None:
     for name, at_s in (moments or {}).items():
         axes.axvline(at_s, color=FLOOR, lw=1.2, ls=(0, (4, 2)))
-        if named:
-            axes.annotate(
-                name, (at_s, 1.0), (3, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8
-            )
+        axes.annotate(
+            name, (at_s, 1.0), (3, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8
+        )
 
 
 def _mark_conspicuous(

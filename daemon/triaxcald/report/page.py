@@ -10,8 +10,9 @@ from markupsafe import Markup
 
 from triaxcald.remarks import assumption
 from triaxcald.report import figures
+from triaxcald.report.before_after import before_after
 from triaxcald.report.budget import read_uncertainty
-from triaxcald.report.charts import bars_picture, stream_picture
+from triaxcald.report.charts import bars_picture, stream_pictures
 from triaxcald.report.choices import choices_in, who_corrects
 from triaxcald.report.document import read_document
 from triaxcald.report.faults import faults_of, left_out
@@ -19,8 +20,9 @@ from triaxcald.report.meanings import factor, in_plain, told
 from triaxcald.report.moments import bracket, moments_in
 from triaxcald.report.over_time import time_pictures
 from triaxcald.report.registers import read_device
-from triaxcald.report.sphere import sphere_picture
+from triaxcald.report.sphere import sphere_pictures
 from triaxcald.report.stream import StreamOverview
+from triaxcald.report.traces import trace_panels
 from triaxcald.report.untrusted import mapping
 from triaxcald.report.verdict import final_word, judge
 
@@ -29,7 +31,7 @@ from triaxcald.report.verdict import final_word, judge
 _SHOWN_ELSEWHERE = {
     "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
     "limits", "data_quality", "advice", "residual", "result", "registers", "verification", "not_written", "device",
-    "choices", "outcome", "candidates", "probabilities", "summary",
+    "choices", "outcome", "candidates", "probabilities", "summary", "notes", "traces",
 }  # fmt: skip
 _LONGEST_LIST = 16
 
@@ -62,19 +64,21 @@ def render_report(
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None, final_word(papers)),
         uncertainty=uncertainty,
         assumed=assumed,
+        traces=trace_panels(document.get("traces"), outcome, unit),
         bars=bars_picture(outcome.stages, outcome.held_out, unit),
-        sphere=sphere_picture(outcome.poses, outcome.stages, floor_g, unit),
+        sphere=sphere_pictures(outcome.poses, outcome.stages, floor_g, unit),
         over_time=time_pictures(
             outcome.poses, outcome.stages, floor_g, moments_in=lambda name: moments_in(outcome, name), unit=unit
         ),
         faults=faults_of(outcome.data_quality),
         left_out=left_out(outcome.poses, unit),
+        rows=before_after(outcome, unit),
         device=device,
         choices=choices_in(document, papers, outcome),
         who_corrects=lambda finding: who_corrects(finding, device),
         told=lambda effect: told(effect, outcome.channel_reference),
         bracket=lambda finding: bracket(finding, outcome),
-        streams=stream_picture(stream) if stream is not None else None,
+        streams=stream_pictures(stream) if stream is not None else (),
         provenance=list(_entries(papers)),
     )
 
@@ -113,7 +117,7 @@ def _environment() -> Environment:
     environment.globals["factor"] = factor
     for function in (
         in_plain, figures.chance, figures.digits, figures.effect_title, figures.fixed, figures.in_full, figures.micro,
-        figures.micro_g, figures.p_value, figures.plus_minus, figures.unit_label,
+        figures.expanded, figures.micro_g, figures.p_value, figures.plus_minus, figures.unit_label,
     ):  # fmt: skip
         environment.filters[function.__name__] = function
     return environment

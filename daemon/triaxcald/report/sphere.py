@@ -27,39 +27,35 @@ _COLOURS = LinearSegmentedColormap.from_list(
 )
 _MOST_DOUBLINGS = 7
 _EQUATOR = 0.02
+WIDTH_IN, HEIGHT_IN = 4.8, 3.4
 _MOST_NUMBERED = 40
 _LABEL_SIZE = (0.25, 0.14)
 """Width and height of a number beside a pose, in radii of the sphere."""
 
 
-def sphere_picture(
+def sphere_pictures(
     poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: ErrorUnit = MICRO_G
-) -> Markup | None:
-    """Poses on two equal-area hemispheres coloured by residual, or None without
-    directions or residuals."""
+) -> tuple[Markup, ...]:
+    """Poses on two equal-area hemispheres coloured by residual, a picture a
+    stage on one scale; none without directions or residuals."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown or all(pose.direction is None for pose in poses):
-        return None
+        return ()
     norm = _doubling_classes(shown, noise_floor_g)
-    alt = f"Residual over the sphere for {len(poses)} poses, {' and '.join(s.label.lower() for s in shown)}"
+    return tuple(_of_stage(poses, stage, norm, unit, f"sphere{i or ''}") for i, stage in enumerate(shown))
 
-    rows = -(-len(shown) // 2)
-    height_in = (2.25 if len(shown) > 1 else 3.2) * rows + 0.75
 
+def _of_stage(poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm, unit: ErrorUnit, name: str) -> Markup:
     def paint(figure: Figure) -> None:
-        # Two stages a row, so that before and after stand beside each other.
-        grid = figure.subplots(rows, 4 if len(shown) > 1 else 2, squeeze=False)
-        pairs = [grid[i // 2, 2 * (i % 2) : 2 * (i % 2) + 2] for i in range(len(shown))]
-        for pair, stage in zip(pairs, shown, strict=True):
-            for axes, side in zip(pair, (1, -1), strict=True):
-                _hemisphere(axes, side, poses, stage, norm)
-                axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
-            pair[0].set_title(stage.label, loc="left", weight="bold", pad=8)
-        for axes in grid.flat[2 * len(shown) :]:
-            axes.axis("off")
-        _colour_bar(figure, grid, norm, 0.2 / height_in, unit)
+        pair = figure.subplots(1, 2, squeeze=False)
+        for axes, side in zip(pair[0], (1, -1), strict=True):
+            _hemisphere(axes, side, poses, stage, norm)
+            axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
+        pair[0, 0].set_title(stage.label, loc="left", weight="bold", pad=8)
+        _colour_bar(figure, pair, norm, 0.2 / HEIGHT_IN, unit)
 
-    return draw("sphere", alt, (8.0, height_in), paint)
+    alt = f"Residual over the sphere for {len(poses)} poses, {stage.label.lower()}"
+    return draw(name, alt, (WIDTH_IN, HEIGHT_IN), paint)
 
 
 def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]:
@@ -139,6 +135,6 @@ def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, s
         spacing="uniform",
     )  # fmt: skip
     bar.set_ticks(list(norm.boundaries), labels=[micro(edge, unit) for edge in norm.boundaries])
-    bar.ax.tick_params(labelsize=7)
-    bar.set_label(f"residual of the magnitude, {unit_label(unit)} (grey: within one noise floor; every colour doubles)")
+    bar.ax.tick_params(labelsize=6, rotation=45)
+    bar.set_label(f"residual of the magnitude, {unit_label(unit)}")
     bar.outline.set_edgecolor(MUTED)

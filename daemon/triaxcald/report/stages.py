@@ -22,6 +22,8 @@ class Residual:
     cross_validated_rms_g: float | None = None
     noise_floor_g: float | None = None
     lack_of_fit_p: float | None = None
+    weighted_rms: float | None = None
+    reduced_chi2: float | None = None
 
 
 @dataclass(frozen=True)

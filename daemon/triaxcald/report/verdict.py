@@ -13,7 +13,7 @@ from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
 from triaxcald.report.document import CANDIDATE, Finding, Outcome
 from triaxcald.report.faults import faults_of
-from triaxcald.report.figures import micro_g
+from triaxcald.report.figures import chance, effect_title, micro_g, ratio
 from triaxcald.report.meanings import told
 from triaxcald.report.untrusted import mapping
 
@@ -26,8 +26,10 @@ _WHAT_IS_LEFT = {
 }
 """Of a search for effects, and of a fit."""
 _MOST_NAMED = 3
-EVEN = 0.5
-"""Below this probability of nothing something acts, whatever that is."""
+USABLE = "usable"
+_CALLS = {USABLE: "Usable", "record_more": "Record more", "investigate": "Investigate"}
+"""What to do with the calibration, as documents have it."""
+_ANOTHER = "one calibration does not hold in all poses"
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,11 @@ def _judged(
     exceeded = [check.name for check in checks if check.passed is False]
     if exceeded:
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
-    if _unexplained(outcome):
+    if _unexplained(outcome) or outcome.another_unit:
         kept = "Every declared limit is kept, but " if checks and not open_checks and not failed else ""
-        headline, what = _UNEXPLAINED, f"{_WHAT_IS_LEFT[outcome.searched]}. {errors}"
+        left = _ANOTHER if outcome.another_unit else _WHAT_IS_LEFT[outcome.searched]
+        headline = _called(outcome, _ANOTHER[0].upper() + _ANOTHER[1:] if outcome.another_unit else _UNEXPLAINED)
+        what = f"{left}. {errors}"
         if _spoiled(outcome) or _rejected(outcome):
             headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
@@ -128,12 +132,19 @@ def _judged(
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
-    headline = _WITHIN if checks else _without_limits(outcome)
-    nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome) or _something(outcome)
-    uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
+    headline = _WITHIN if checks else _called(outcome, _without_limits(outcome))
+    nothing_sure = outcome.something_is_left or _could_find_nothing(outcome) or bool(outcome.averaged)
+    more = outcome.call in _CALLS and outcome.call != USABLE
+    uncertain = not checks and (more or _uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
+
+
+def _called(outcome: Outcome, headline: str) -> str:
+    """With what to do with the calibration, where the document says it."""
+    call = _CALLS.get(outcome.call)
+    return headline if call is None else f"{call}: {headline[:1].lower()}{headline[1:]}"
 
 
 def _without_limits(outcome: Outcome) -> str:
@@ -141,8 +152,10 @@ def _without_limits(outcome: Outcome) -> str:
         return "No lack of fit shows"
     if _could_find_nothing(outcome):
         return "No effect could show in full"
+    if not outcome.findings and outcome.averaged:
+        return "No effect certain, an average over what may act corrected"
     if not outcome.findings:
-        sure = not _lacks_fit(outcome) and not _something(outcome)
+        sure = not outcome.something_is_left
         return "Nothing found beyond noise" if sure else "Nothing certain found beyond noise"
     return _effects(outcome)
 
@@ -160,11 +173,6 @@ def _could_find_nothing(outcome: Outcome) -> bool:
     return outcome.searched and not outcome.findings and none_could_show(outcome.blind_to)
 
 
-def _something(outcome: Outcome) -> bool:
-    """Whether it is likelier than not that something acts."""
-    return outcome.nothing_probability is not None and outcome.nothing_probability < EVEN
-
-
 def _spoiled(outcome: Outcome) -> bool:
     return any(fault.spoils for fault in faults_of(outcome.data_quality))
 
@@ -180,11 +188,15 @@ def _uncertain(outcome: Outcome) -> bool:
 
 def _found(outcome: Outcome) -> str:
     """The effects in words, each with its name."""
-    if not outcome.searched or not (outcome.findings or _tested(outcome)):
+    unexplained = outcome.unexplained is not None and outcome.unexplained.significant
+    if not outcome.searched or not (outcome.findings or _tested(outcome)) or (unexplained and not outcome.findings):
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
-    if not outcome.findings and _something(outcome):
+    if not outcome.findings and outcome.averaged:
+        each = ", ".join(f"{effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items())
+        return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
+    if not outcome.findings and outcome.something_is_left:
         return "Something acts beyond the linear model, and these poses do not tell what. "
     if not outcome.findings:
         return "No effect beyond the linear model was found. "
@@ -195,12 +207,14 @@ def _found(outcome: Outcome) -> str:
 
 
 def _named(finding: Finding, outcome: Outcome) -> str:
-    names = (finding.effect, *finding.alternatives)
+    names = {finding.effect: finding.probability, **{n: finding.probabilities.get(n) for n in finding.alternatives}}
     clauses = []
-    for name in names[:_MOST_NAMED]:
+    for name, probability in list(names.items())[:_MOST_NAMED]:
         known = told(name, outcome.channel_reference)
         title = known.title.lower()
-        clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
+        beside = [] if known.clause == title else [title]
+        beside += [] if probability is None else [f"probability {chance(probability)}"]
+        clauses.append(f"{known.clause} ({', '.join(beside)})" if beside else known.clause)
     clauses += ["others"] if len(names) > _MOST_NAMED else []
     doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
     return " or ".join(clauses) + doubt
@@ -250,7 +264,12 @@ def _errors(outcome: Outcome) -> str:
     text = f"Error of the magnitude, {name}: {micro_g(after, unit)} rms"
     if len(pairs) > 1 and pairs[0] is not None:
         text += f", {micro_g(pairs[0], unit)} before"
-    return f"{text}; noise floor {micro_g(floor_g, unit)}."
+    weighted = [s.residual.weighted_rms for s in outcome.stages]
+    in_errors = ""
+    if weighted and weighted[-1] is not None:
+        before = f", {ratio(weighted[0])} before" if len(weighted) > 1 else ""
+        in_errors = f"; residuals in standard errors: {ratio(weighted[-1])} rms{before}"
+    return f"{text}; noise floor {micro_g(floor_g, unit)}{in_errors}."
 
 
 def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: ErrorUnit) -> list[str]:

@@ -236,7 +236,7 @@ def test_of_poses_that_can_show_no_effect_the_console_says_so_and_why(
 
 def test_an_error_that_cannot_be_cross_validated_is_no_dash_in_a_sentence() -> None:
     unit = ErrorUnit()
-    assert cross_validated(Residual(1e-6, 2e-6, 3.5e-6, 1e-6, None), unit) == "cross-validated 3.5 µg"
+    assert cross_validated(Residual(1e-6, 2e-6, 3.5e-6, 1e-6, None), unit) == "cross-validated 3.50 µg"
     assert cross_validated(Residual(1e-6, 2e-6, None, 1e-6, None), unit) == (
         "not cross-validated (without one of the poses the others carry no fit)"
     )

@@ -9,6 +9,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning import directions
+from triaxcal.rounding import concise
 from triaxcal.synthetic import noisy_poses
 from triaxcald.certificate import Certified
 from triaxcald.cli.line import show_outcome
@@ -46,7 +47,7 @@ def test_what_is_corrected_is_told_with_its_probability_and_its_coefficients(
     assert f"corrected: {effect.name} (probability {loop.after.weights[effect.name]:.2g})" in said
     for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
         assert error is not None
-        assert f"{name} {value:+.4g} ± {error:.1g} {unit}" in said
+        assert f"{name} {concise(value, error, unit)}" in said
 
 
 def test_the_four_lines_of_the_diagnosis_come_first(loop: Loop, capsys: pytest.CaptureFixture[str]) -> None:

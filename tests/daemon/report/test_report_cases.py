@@ -13,9 +13,9 @@ import pytest
 
 from triaxcald.report import render_report
 from triaxcald.report.document import read_document
-from triaxcald.report.over_time import time_picture
+from triaxcald.report.over_time import time_panels
 from triaxcald.report.registers import read_device
-from triaxcald.report.sphere import sphere_picture
+from triaxcald.report.sphere import sphere_pictures
 
 _spec = spec_from_file_location("sample_documents", Path(__file__).with_name("sample_documents.py"))
 assert _spec is not None
@@ -115,8 +115,8 @@ def test_an_adopted_effect_has_words_formula_shape_and_what_to_change(words: dic
     html, text = page(words)
     assert text.index("Effect found and corrected") < text.index("the bias settles after the start") < 300
     assert "e = q exp(−t / τ)" in text
-    assert "x | x | exp(−t / τ) | (0.827 ± 0.015) × 10⁻³ g" in text
-    assert "time_constant | | τ | 88.1 ± 2.2 s" in text
+    assert "x | x | exp(−t / τ) | 0.827(15) × 10⁻³ g" in text
+    assert "time_constant | | τ | 88.1(2.2) s" in text
     assert "What to change Wait." in text
     assert 'class="verdict within"' in html
 
@@ -210,13 +210,13 @@ def test_two_effects_are_corrected_at_once_in_pictures_above_the_channels_that_m
     add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")}, alternatives=["bias_drift"])
     html, text = page(loop)
     assert "2 effects found, cause uncertain" in text
-    assert "Before | 900 µg | 1100 µg" in text
     last = loop["after"]
-    assert f"After | {1e6 * last['rms_g']:.3g} µg | {1e6 * last['cross_validated_rms_g']:.3g} µg" in text
-    bars, sphere, time = (next(line for line in labels(html) if what in line) for what in ("Bars", "sphere", "time"))
-    assert "Before 900 µg" in bars
-    assert "before and after" in sphere
-    assert time.endswith("before and after, above temp_c")
+    assert f"Cross-validated error, rms | 1100 µg | {1e6 * last['cross_validated_rms_g']:.3g} µg" in text
+    assert f"Residual, rms | 900 µg | {1e6 * last['rms_g']:.3g} µg" in text
+    assert "Before 900 µg" in next(line for line in labels(html) if "Bars" in line)
+    for what in ("over the sphere", "in order of time"):
+        assert [line.rpartition(" ")[2] for line in labels(html) if what in line] == ["before", "after"]
+    assert "Channel temp_c" in labels(html)
 
 
 def test_what_no_effect_describes_is_told_in_the_words_of_the_document(words: dict[str, Any]) -> None:
@@ -463,17 +463,16 @@ def test_damaged_registers_tell_nothing_and_break_nothing(damage: object) -> Non
 def test_a_channel_that_a_pose_lacks_is_not_drawn(loop: dict[str, Any], damage: object) -> None:
     loop["calibration"]["poses"][2]["channels"] = damage
     outcome = read_document(loop)
-    drawing = time_picture(outcome.poses, outcome.stages, None)
-    assert drawing is not None
-    assert "temp_c" not in drawing
+    drawings = time_panels(outcome.poses, outcome.stages, None)
+    assert drawings
+    assert not any("temp_c" in drawing for drawing in drawings)
 
 
 @pytest.mark.slow
 def test_a_small_set_of_poses_carries_its_numbers_and_a_large_one_does_not() -> None:
     for count, numbered in ((14, True), (60, False)):
         outcome = read_document(samples.loop_document(count))
-        drawing = sphere_picture(outcome.poses, outcome.stages, 1.5e-5)
-        assert drawing is not None
+        drawing = sphere_pictures(outcome.poses, outcome.stages, 1.5e-5)[-1]
         assert (">13</text>" in drawing) is numbered
 
 
@@ -483,8 +482,7 @@ def test_a_pose_taken_twice_has_one_label_with_both_numbers() -> None:
     poses = document["calibration"]["poses"]
     poses[9]["direction"] = poses[2]["direction"]
     outcome = read_document(document)
-    drawing = sphere_picture(outcome.poses, outcome.stages, 1.5e-5)
-    assert drawing is not None
+    drawing = sphere_pictures(outcome.poses, outcome.stages, 1.5e-5)[-1]
     assert ">3, 10</text>" in drawing
     assert ">3</text>" not in drawing
 
@@ -496,11 +494,11 @@ def test_notes_that_would_lie_on_each_other_are_left_out() -> None:
     for number, residual_g in ((20, 9e-5), (21, 9.1e-5), (40, -9e-5)):
         document["calibration"]["poses"][number - 1] |= {"residual_g": residual_g, "studentized": residual_g * 1e5}
     outcome = read_document(document)
-    drawing = time_picture(outcome.poses, outcome.stages, None)
-    assert drawing is not None
-    assert ">pose 21</text>" in drawing
-    assert ">pose 40</text>" in drawing
-    assert ">pose 20</text>" not in drawing
+    drawings = time_panels(outcome.poses, outcome.stages, None)
+    assert drawings
+    assert ">pose 21</text>" in drawings[1]
+    assert ">pose 40</text>" in drawings[1]
+    assert ">pose 20</text>" not in drawings[1]
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def test_each_recording_has_its_picture_over_time_and_the_moment_is_marked_in_it
     pictures = {
         label: svg
         for label, svg in re.findall(r'<svg role="img" aria-label="([^"]*)"(.*?)</svg>', html, flags=re.DOTALL)
-        if "in order of time" in label
+        if "in order of time, after" in label
     }
     assert [label.partition(" in order")[0] for label in pictures] == [
         "Residual of 7 poses of first.csv",
@@ -156,7 +156,7 @@ def test_names_with_the_unit_of_errors_in_them_stay_as_they_are(loop: dict[str, 
         pose["channels"] = {"dust µg": pose["channels"]["temp_c"]}
     loop["data_quality"] = ["odd: 1e-6 µg is in channel dust µg"]
     html, text = page(loop)
-    assert "above dust µg" in html
+    assert 'aria-label="Channel dust µg of first.csv"' in html
     assert "odd: 1e-6 µg is in channel dust µg" in text
     assert html.count("µg") - html.count("dust µg") - html.count("1e-6 µg") == html.count("µg-like")
     assert f"residual, 10⁻¹² {unit}" in unescape(html)

@@ -76,7 +76,7 @@ SENTENCES: list[tuple[Caution, str]] = [
     (HighLeverage(FIRST, 0.987), "the pose at 10.0 s alone determines a parameter (leverage 0.99)"),
     (
         ExcessVariance(2.5e-4),
-        "residuals show 250.0 µg beside the noise of each pose; the standard errors allow for it",
+        "residuals show 250 µg beside the noise of each pose; the standard errors allow for it",
     ),
     (
         BirgeRatio(1.84),

@@ -7,6 +7,8 @@ from dataclasses import replace
 import pytest
 
 from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict
+from triaxcal.estimate.calibration import Residual
+from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import ChangePoint, Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
@@ -53,7 +55,7 @@ def test_the_cause_is_told_with_its_probability() -> None:
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
     found = replace(NOTHING, unexplained=Unexplained(0.97, UnmodelledKind.POSE_BEFORE, 240e-6, True))
-    said = "something acts that no effect describes (probability 0.97), 240.0 µg rms; it goes with the pose before"
+    said = "something acts that no effect describes (probability 0.97), 240 µg rms; it goes with the pose before"
     assert cause(found) == said
 
 
@@ -78,11 +80,28 @@ def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
 
 def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
     assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
-    said = diagnosis.errors(601e-6, 18e-6, assumed, SMALL)
-    assert said == (
-        "residual rms 601.0 µg before, 18.0 µg after; expanded uncertainty in the next recording 4100.0 µg (2000.0 µg "
-        "from start to start, assumed)"
+    before = Residual(601e-6, 9e-4, 812e-6, 20e-6, 1e-9, 28.1, 902.0)
+    after = Residual(18e-6, 4e-5, 24e-6, 2e-5, 0.4, 0.83, 0.97)
+    assert diagnosis.errors(before, after, None, assumed, SMALL) == (
+        "cross-validated rms 812 µg before, 24.0 µg after; residuals in standard errors, rms, 28 before, 0.83 after; "
+        "χ² per degree of freedom 902 before, 0.97 after; residual rms 601 µg before, 18.0 µg after; "
+        "expanded uncertainty in the next recording 4100 µg (2000 µg from start to start, assumed)"
     )
+    held = HoldOut(131e-6, 16.2e-6, 15e-6, 9)
+    said = diagnosis.errors(before, after, held, assumed, SMALL)
+    assert said.startswith("held-out rms 131 µg before, 16.2 µg after; ")
+
+
+def test_an_error_that_nothing_corrects_is_told_once() -> None:
+    one = Residual(601e-6, 9e-4, None, 20e-6, None)
+    said = diagnosis.errors(one, one, None, NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED), SMALL)
+    assert said.startswith("residual rms 601 µg; expanded")
+
+
+def test_an_average_over_what_may_act_is_no_absence_of_effects() -> None:
+    said = diagnosis.cause(NOTHING, (), (), BEGAN, SMALL, {"warm_up": 0.3}, {"warm_up": 0.3})
+    assert "no effect shows" not in said
+    assert said.endswith("the correction averages over what may act, each by its probability: warm_up (0.3)")
 
 
 @pytest.mark.parametrize("refused", Refusal)

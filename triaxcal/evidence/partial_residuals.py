@@ -1,0 +1,626 @@
+"""Partial residuals: what the poses show of one effect alone, against the
+variable that drives it (Larsen and McCleary 1972, Technometrics 14:781).
+
+A partial residual is the residual of the full model plus the contribution of
+one effect. The nine linear parameters absorb a part of every effect, so that
+the contribution is what they leave of it in the poses that the fit uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.distributions import t_ppf
+from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.contract import (
+    BEFORE,
+    CHANGE,
+    DURATION,
+    RUN,
+    SCATTER,
+    SINCE_START,
+    TIME,
+    Effect,
+    channel_of,
+    is_derived,
+    lag_in,
+    rate_of,
+)
+from triaxcal.effects.in_run import runs_named
+from triaxcal.effects.plugins import EffectFault
+from triaxcal.errors import Refused
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.evidence.linearised_data import LinearisedData
+from triaxcal.model.sensor import LINEAR
+from triaxcal.poses.covariates import static_covariates
+
+READINGS = ("reading_x", "reading_y", "reading_z")
+"""The specific force along each sensitive axis, in units of the reference."""
+PREDICTED = "predicted"
+"""The contribution to |a| by the fit, in units of the reference: the variable
+of an effect that no single one drives."""
+POSE = "pose"
+"""The number of the pose, from 1, where nobody knows the times."""
+LEVEL = 0.95
+"""Of the band about a curve."""
+POINTS = 41
+"""Of a curve: more than a picture of some 300 pixels shows as straight lines."""
+PANELS = 3
+"""Of an effect with more parts those are shown that contribute most (rms in
+standard errors); of what has no name the three most telling variables."""
+VISIBLE = 0.45
+"""The least share with which |a| follows an axis, for a pose to be shown: below
+it the error bar is more than twice that of |a|. It is less than the 0.5 of the
+edges of a cube, which rounding must not decide."""
+SAME = 1e-6
+"""Relative difference below which two functions are one: they differ by
+rounding, or by far more."""
+OF_READING, OF_COVARIATE = (3, 4, 5), (1, 2)
+"""Degrees of the polynomials of `telling_variables`."""
+AXES = 3
+"""The sensitive axes, and the components of a vector."""
+
+
+class Quantity(StrEnum):
+    """What a partial residual is of."""
+
+    MAGNITUDE = "magnitude"
+    """|a|."""
+    READING = "reading"
+    """The reading along one axis; of what changes a scale factor, at one
+    reference along the axis."""
+    STANDARD_ERRORS = "standard_errors"
+    """|a|, over the standard error of the pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """k partial residuals against one variable, and the fitted curve.
+
+    ``effect`` is empty where no effect is meant; ``axis`` ("x", "y", "z") the
+    one on which its ``coefficients`` act, empty where that is not one.
+    ``variable`` is a covariate by its name (`triaxcal.effects.contract`), one
+    of `READINGS`, `PREDICTED` or `POSE`; `unit_of` has its unit. ``pose`` (k,)
+    are the places among all poses that were given; ``x`` (k,) the variable;
+    ``y`` (k,) the partial residuals and ``error`` (k,) one standard error of
+    the pose, in units of the reference unless the ``quantity`` says otherwise;
+    ``excluded`` (k,) the poses that the fit does not use. ``curve`` (m,) is the
+    contribution at the values ``grid`` (m,) of the variable, and
+    ``half_width`` (m,) that of its 95 % band; none where there is no curve.
+    ``share`` is how telling the variable of an unexplained residual is
+    (`telling_variables`), else None.
+    """
+
+    effect: str
+    axis: str
+    coefficients: tuple[str, ...]
+    variable: str
+    quantity: Quantity
+    pose: Ints
+    x: Floats
+    y: Floats
+    error: Floats
+    excluded: Bools
+    grid: Floats
+    curve: Floats
+    half_width: Floats
+    share: float | None = None
+
+
+def of_effect(rows: LinearisedData, c: Calibration, name: str) -> tuple[Trace, ...]:
+    """Of the effect of that name in the model ``c``, which was fitted to these
+    ``rows``: a trace for each axis on which it acts, `PANELS` at most. Raises
+    KeyError where the model has no such effect."""
+    data = _Data.of(rows, c)
+    at = LINEAR
+    for effect, q in c.sensor.effects:
+        own = slice(at, at + len(q))
+        at = own.stop
+        if effect.name == name:
+            return tuple(data.traces_of(effect, np.asarray(q), c.covariance[own, own], c.coverage_factor(LEVEL)))
+    raise KeyError(name)
+
+
+def telling_variables(rows: LinearisedData, c: Calibration) -> tuple[Trace, ...]:
+    """What the model ``c`` leaves, against the `PANELS` variables that tell most
+    of it.
+
+    The measure is the adjusted share of the weighted sum of squares that a
+    smooth curve in the variable takes away beside the nine parameters: 1 less
+    the ratio of the mean squares with and without it. The curve is a polynomial
+    of degree 5 in the reading of an axis, whose first three terms the nine
+    absorb, and of degree 2 on each axis in any other variable.
+    """
+    data = _Data.of(rows, c).of_means()
+    found = [fit for drivers in data.candidates() if drivers and (fit := data.fitted(drivers)) is not None]
+    best = sorted(found, key=lambda fit: -fit.share)[:PANELS]
+    return tuple(data.trace_of_curve(fit) for fit in best)
+
+
+def residuals(c: Calibration) -> Trace:
+    """Of all poses whose residual is known, in standard errors, against the
+    time; against the number of the pose where several recordings, or unknown
+    times, have none in common."""
+    known = [i for i, p in enumerate(c.poses) if np.isfinite(p.residual_g) and p.standard_error_g > 0]
+    poses = [c.poses[i] for i in known]
+    t_s = np.array([p.pose.t_s for p in poses])
+    timed = len(t_s) > 1 and bool(np.ptp(t_s) > 0) and len({p.pose.run.index for p in poses}) == 1
+    nothing = np.empty(0)
+    return Trace(
+        effect="",
+        axis="",
+        coefficients=(),
+        variable=SINCE_START if timed else POSE,
+        quantity=Quantity.STANDARD_ERRORS,
+        pose=np.array(known, dtype=int),
+        x=t_s if timed else np.array(known, dtype=float) + 1,
+        y=np.array([p.residual_g / p.standard_error_g for p in poses]),
+        error=np.ones(len(poses)),
+        excluded=np.array([not p.used for p in poses], dtype=bool),
+        grid=nothing,
+        curve=nothing,
+        half_width=nothing,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Coefficients:
+    """``values`` (p,), their ``covariance`` (p,p), and the factor that makes a
+    standard error half a band."""
+
+    values: Floats
+    covariance: Floats
+    coverage: float
+
+    def standard_error(self, by_one: Floats) -> Floats:
+        """(m,) of sums of them, by so much (m,p) of each."""
+        return np.asarray(np.sqrt(np.maximum(np.einsum("mp,pq,mq->m", by_one, self.covariance, by_one), 0.0)))
+
+    @property
+    def relative_error(self) -> float:
+        """Of all of them by one factor."""
+        squared = float(self.values @ np.linalg.pinv(self.covariance, hermitian=True) @ self.values)
+        return float(1 / np.sqrt(max(squared, 1e-300)))
+
+    def only(self, index: Ints, given: Ints | None = None) -> _Coefficients:
+        """Some of them, as they are known if those ``given`` are as estimated."""
+        covariance = self.covariance[np.ix_(index, index)]
+        if given is not None and len(given):
+            crossed, others = self.covariance[np.ix_(index, given)], self.covariance[np.ix_(given, given)]
+            covariance = covariance - crossed @ np.linalg.pinv(others, hermitian=True) @ crossed.T
+        return replace(self, values=self.values[index], covariance=covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Driver:
+    """Coefficients that act on |a| by ``loading`` (n,) times functions of one
+    variable ``x`` (n,). ``functions`` gives k values of them (k,p), and
+    ``absorbed`` those of the functions (k,h) of the same variable that the nine
+    parameters can take away from them. ``whole``: these alone are taken away;
+    else the function itself may also come out smaller, as it does where the
+    variable went along with the directions. ``rows`` (n,) are the poses in
+    which it acts."""
+
+    variable: str
+    quantity: Quantity
+    axis: str
+    x: Floats
+    loading: Floats
+    functions: Callable[[Floats], Floats]
+    absorbed: Callable[[Floats], Floats]
+    whole: bool
+    rows: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """A smooth curve in one variable: the ``coefficients`` of all ``drivers``,
+    as many of each."""
+
+    drivers: Sequence[_Driver]
+    coefficients: _Coefficients
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """The poses of ``rows`` under the model ``c``; ``used`` (N,) are the rows of
+    those that the fit uses."""
+
+    rows: LinearisedData
+    c: Calibration
+    used: Bools
+
+    @classmethod
+    def of(cls, rows: LinearisedData, c: Calibration) -> _Data:
+        used = np.array([c.poses[place].used for place in rows.places], dtype=bool)
+        return cls(rows, c, np.resize(used, len(rows.y)))
+
+    def of_means(self) -> _Data:
+        """Without the slopes inside the poses."""
+        return replace(self, used=self.used & (np.arange(len(self.used)) < self.rows.n))
+
+    def left(self, columns: Floats) -> Floats:
+        """What the nine parameters, fitted to the poses used, leave of columns
+        (N,…) in the means (n,…)."""
+        linear, n = self.rows.linear, self.rows.n
+        found = np.linalg.lstsq(linear[self.used], columns[self.used], rcond=None)[0]
+        return np.asarray(columns[:n] - linear[:n] @ found)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """(n,) of |a|, under all effects of the model."""
+        y = self.rows.y.copy()
+        for effect, q in self.c.sensor.effects:
+            y -= self.rows.by_coefficients(effect) @ q
+        return -self.left(y) * self.error
+
+    @property
+    def error(self) -> Floats:
+        """(n,) by which the means were weighted."""
+        return self.rows.error[: self.rows.n]
+
+    @property
+    def in_fit(self) -> Bools:
+        """(n,)"""
+        return self.used[: self.rows.n]
+
+    @cached_property
+    def covariates(self) -> Mapping[str, Floats]:
+        return self.rows.problem.covariates
+
+    @cached_property
+    def s(self) -> Floats:
+        """(n,3) along the sensitive axes."""
+        problem = self.rows.problem
+        return self.rows.point.sensor(problem).along_axes(problem.u, problem.covariates)
+
+    @cached_property
+    def by_axis(self) -> Floats:
+        """(n,3) how much |a| follows the reading of each axis."""
+        problem = self.rows.problem
+        return self.rows.point.sensor(problem).radius(problem.u, problem.covariates).by_v
+
+    def traces_of(self, effect: Effect, q: Floats, covariance: Floats, coverage: float) -> Iterator[Trace]:
+        contribution = self.contribution(self.rows.by_coefficients(effect))
+        groups = _groups(effect)
+        weight = [self.weight(contribution[:, index] @ q[index]) for index in groups]
+        whole = _Coefficients(q, covariance, coverage)
+        for k in sorted(sorted(range(len(groups)), key=lambda k: -weight[k])[:PANELS]):
+            if weight[k] > 0:
+                index = groups[k]
+                names = tuple(effect.coefficients[i].name for i in index)
+                own = whole.only(index, given=_of_other_recordings(effect, index))
+                made = self.trace(self.driver(effect, index), contribution[:, index], own, self.residual)
+                yield replace(made, effect=effect.name, coefficients=names)
+
+    def contribution(self, columns: Floats) -> Floats:
+        """(n,p) to |a| by one of each coefficient, after what the nine
+        parameters absorb, of ``columns`` (N,p) of the rows."""
+        return -self.left(columns) * self.error[:, None]
+
+    def weight(self, contribution: Floats) -> float:
+        """Its rms in standard errors."""
+        return float(np.sqrt(np.mean((contribution / self.error)[self.in_fit] ** 2)))
+
+    def trace(self, driver: _Driver | None, contribution: Floats, of: _Coefficients, residual: Floats) -> Trace:
+        """``contribution`` (n,p) as above, ``residual`` (n,) that of the full
+        model."""
+        if driver is None:
+            return self._against_predicted(residual, contribution @ of.values, of)
+        shown = driver.rows & (np.abs(driver.loading) >= VISIBLE)
+        grid = _grid(driver, driver.x[shown])
+        curves = self._curves(driver, contribution)
+        by_one, loading = curves(grid), driver.loading[shown]
+        return Trace(
+            effect="",
+            axis=driver.axis,
+            coefficients=(),
+            variable=driver.variable,
+            quantity=driver.quantity,
+            pose=self.rows.places[shown],
+            x=driver.x[shown],
+            y=curves(driver.x[shown]) @ of.values + residual[shown] / loading,
+            error=self.stated_error[shown] / np.abs(loading),
+            excluded=~self.in_fit[shown],
+            grid=grid,
+            curve=by_one @ of.values,
+            half_width=of.coverage * of.standard_error(by_one),
+        )
+
+    @cached_property
+    def stated_error(self) -> Floats:
+        """(n,) standard errors of the poses as documents have them."""
+        return np.array([self.c.poses[place].standard_error_g for place in self.rows.places])
+
+    def _curves(self, driver: _Driver, contribution: Floats) -> Callable[[Floats], Floats]:
+        """What one of each coefficient contributes at values of the variable:
+        the functions themselves and those that the nine parameters can take
+        away, adjusted to the ``contribution`` (n,p) in the poses. A part of it
+        that went along with the directions is no function of the variable, and
+        is left out."""
+        rows = driver.rows & self.in_fit
+        weight = (driver.loading / self.error)[rows, None]
+        own, taken = driver.functions(driver.x[rows]) * weight, driver.absorbed(driver.x[rows]) * weight
+        target = contribution[rows] / self.error[rows, None]
+        if driver.whole:
+            found = _least_squares(taken, target - own)
+            return lambda x: np.asarray(driver.functions(x) + driver.absorbed(x) @ found)
+        found = _least_squares(np.concatenate([own, taken], axis=1), target)
+        return lambda x: np.asarray(np.concatenate([driver.functions(x), driver.absorbed(x)], axis=1) @ found)
+
+    def _against_predicted(self, residual: Floats, predicted: Floats, of: _Coefficients) -> Trace:
+        """Of an effect that no single variable drives: the curve is the straight
+        line on which both are equal, and the band that of the whole effect's
+        size."""
+        grid = np.linspace(predicted.min(), predicted.max(), POINTS)
+        return Trace(
+            effect="",
+            axis="",
+            coefficients=(),
+            variable=PREDICTED,
+            quantity=Quantity.MAGNITUDE,
+            pose=self.rows.places,
+            x=predicted,
+            y=predicted + residual,
+            error=self.stated_error,
+            excluded=~self.in_fit,
+            grid=grid,
+            curve=grid,
+            half_width=of.coverage * of.relative_error * np.abs(grid),
+        )
+
+    # What drives an effect.
+
+    def driver(self, effect: Effect, index: Ints) -> _Driver | None:
+        """None where no single variable drives these coefficients, or too few
+        poses show it."""
+        try:
+            basis = effect.basis(self.s, self.covariates)[:, :, index]
+            axes = [i for i in range(AXES) if basis[:, i].any()]
+            tried = self._drivers(effect, index, axes[0], basis[:, axes[0]]) if len(axes) == 1 else iter(())
+            return next((driver for driver in tried if self._shows(driver)), None)
+        except (EffectFault, Refused):  # of another package, which does not say what it adds elsewhere
+            return None
+
+    def _shows(self, driver: _Driver) -> bool:
+        x = driver.x[driver.rows & self.in_fit & (np.abs(driver.loading) >= VISIBLE)]
+        return len(x) > 1 and bool(np.ptp(x) > 0)
+
+    def _drivers(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
+        """Those by which the ``basis`` (n,p) on the axis follows from one
+        variable."""
+        if effect.needs:
+            yield from self._by_covariate(effect, index, axis, basis)
+        else:
+            yield from self._by_reading(effect, index, axis, basis)
+
+    def _by_reading(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
+        """By that of the axis itself, or by that of another, with which its
+        scale factor changes."""
+        reference = self.rows.problem.reference
+
+        def own(x: Floats) -> Floats:
+            return effect.basis(_on_sphere(x, axis, reference), {})[:, axis, index]
+
+        if _same(own(self.s[:, axis]), basis):
+            yield self.of_reading(axis, lambda x: own(x) * x[:, None] / reference)
+        for other in range(AXES):
+            if other != axis:
+                functions = _Beside(effect, index, axis, other, reference)
+                gain = self.s[:, axis] / reference
+                if _same(gain[:, None] * functions(self.s[:, other]), basis):
+                    on_axis = self.on_axis(READINGS[other], axis, self.s[:, other], functions)
+                    yield replace(on_axis, loading=on_axis.loading * gain)
+
+    def _by_covariate(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
+        """On the bias of the axis, or on its scale factor."""
+        name = _driving(effect, axis)
+        if name is None:
+            return
+        problem = self.rows.problem
+        runs = runs_named(effect.coefficients[i].name for i in index) if name != RUN else ()
+        rows = np.isin(self.rows.run, runs) if runs else np.ones(self.rows.n, dtype=bool)
+        held = {n: float(np.median(self.covariates[n][rows])) for n in effect.needs}
+
+        def functions(x: Floats) -> Floats:
+            full = np.tile(problem.reference * np.eye(AXES)[axis], (len(x), 1))
+            covariates = {n: np.full(len(x), v) for n, v in held.items()}
+            return effect.basis(full, covariates | {name: x - problem.channel_reference[name]})[:, axis, index]
+
+        on_axis = replace(self.on_axis(name, axis, problem.channels[name], functions), rows=rows)
+        for gain in (np.ones(self.rows.n), self.s[:, axis] / problem.reference):
+            if _same((gain[:, None] * functions(on_axis.x))[rows], basis[rows]):
+                yield replace(on_axis, loading=on_axis.loading * gain)
+
+    def of_reading(self, axis: int, functions: Callable[[Floats], Floats]) -> _Driver:
+        """Of |a|, by the reading of an axis. The nine parameters take away its
+        square, itself and a constant, which is the square of all three."""
+        return _Driver(
+            variable=READINGS[axis],
+            quantity=Quantity.MAGNITUDE,
+            axis="xyz"[axis],
+            x=self.s[:, axis],
+            loading=np.ones(self.rows.n),
+            functions=functions,
+            absorbed=lambda x: (x[:, None] / self.rows.problem.reference) ** np.arange(3),
+            whole=True,
+            rows=np.ones(self.rows.n, dtype=bool),
+        )
+
+    def on_axis(self, variable: str, axis: int, x: Floats, functions: Callable[[Floats], Floats]) -> _Driver:
+        """On the bias of an axis, from which the nine parameters take a
+        constant away."""
+        return _Driver(
+            variable=variable,
+            quantity=Quantity.READING,
+            axis="xyz"[axis],
+            x=x,
+            loading=self.by_axis[:, axis],
+            functions=functions,
+            absorbed=lambda x: np.ones((len(x), 1)),
+            whole=False,
+            rows=np.ones(self.rows.n, dtype=bool),
+        )
+
+    # What tells most where nothing has a name.
+
+    def candidates(self) -> Iterator[Sequence[_Driver]]:
+        """Each variable, with the axes on which it may act."""
+        for axis in range(AXES):
+            yield [self.of_reading(axis, _Polynomials.over(self.s[:, axis], OF_READING))]
+        still = static_covariates(self.rows.poses)
+        for name, x in self.rows.problem.channels.items():
+            if name not in still and np.isfinite(x).all() and np.ptp(x) > 0:
+                functions = _Polynomials.over(x, OF_COVARIATE)
+                yield [self.on_axis(name, axis, x, functions) for axis in _axes_of(name)]
+
+    def fitted(self, drivers: Sequence[_Driver]) -> _Curve | None:
+        """The polynomials in one variable, beside the nine parameters; None
+        where these leave nothing of them, or no degree of freedom."""
+        columns = self.left(self.columns(drivers))[self.in_fit]
+        misfit = (-self.residual / self.error)[self.in_fit]
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        q, _, rank, _ = np.linalg.lstsq(columns / size, misfit, rcond=SAME)
+        q, free = q / size, len(misfit) - LINEAR
+        before = float(misfit @ misfit)
+        if rank == 0 or free <= rank or not before > 0:
+            return None
+        after = float(np.sum((misfit - columns @ q) ** 2)) / (free - rank)
+        inverse = np.linalg.pinv((columns / size).T @ (columns / size), rcond=SAME, hermitian=True)
+        covariance = max(1.0, after) * inverse / np.outer(size, size)
+        coverage = float(t_ppf((1 + LEVEL) / 2, free - rank))
+        return _Curve(drivers, _Coefficients(q, covariance, coverage), 1 - after / (before / free))
+
+    def columns(self, drivers: Sequence[_Driver]) -> Floats:
+        """(N,p) as `LinearisedData.by_coefficients` has them, in the means
+        alone."""
+        each = [driver.loading[:, None] * driver.functions(driver.x) / self.error[:, None] for driver in drivers]
+        means = -np.concatenate(each, axis=1)
+        return np.concatenate([means, np.zeros((len(self.rows.y) - self.rows.n, means.shape[1]))])
+
+    def trace_of_curve(self, fit: _Curve) -> Trace:
+        """On the axis on which it does most."""
+        contribution, of = self.contribution(self.columns(fit.drivers)), fit.coefficients
+        parts = np.array_split(np.arange(len(of.values)), len(fit.drivers))
+        best = max(range(len(parts)), key=lambda k: self.weight(contribution[:, parts[k]] @ of.values[parts[k]]))
+        residual = self.residual - contribution @ of.values
+        own = parts[best]
+        made = self.trace(fit.drivers[best], contribution[:, own], of.only(own), residual)
+        return replace(made, share=fit.share)
+
+
+def unit_of(variable: str) -> str:
+    """Of a variable of a trace; g stands for the unit of the reference, and the
+    name of a channel in brackets for that of the channel."""
+    if variable in (POSE, RUN):
+        return ""
+    if variable in (*READINGS, PREDICTED, *BEFORE, *CHANGE):
+        return "g"
+    if variable in SCATTER:
+        return "g²"
+    if variable in (TIME, SINCE_START):
+        return "s"
+    lag, bare = lag_in(variable), variable.removesuffix(rate_of(""))
+    thermal = channel_of(lag[0] if lag else bare) == TEMPERATURE
+    if bare != variable:
+        return "K/s" if thermal else f"[{channel_of(bare)}]/s"
+    return ("K" if lag else "°C") if thermal else f"[{channel_of(lag[0] if lag else variable)}]"
+
+
+def _groups(effect: Effect) -> list[Ints]:
+    """The coefficients that belong together: of one part, and of one of several
+    recordings."""
+    keys = [(c.part, runs_named([c.name]) if RUN not in effect.needs[:1] else ()) for c in effect.coefficients]
+    return [np.array([i for i, other in enumerate(keys) if other == key]) for key in dict.fromkeys(keys)]
+
+
+def _of_other_recordings(effect: Effect, index: Ints) -> Ints:
+    """The coefficients of the same part in other recordings. What these have in
+    common is also the unit's own bias, which no picture of one recording
+    shows: its band is that beside the others."""
+    part = effect.coefficients[index[0]].part
+    own = set(index.tolist())
+    runs = runs_named(effect.coefficients[i].name for i in index)
+    same = [i for i, c in enumerate(effect.coefficients) if runs and c.part == part and i not in own]
+    return np.array(same, dtype=int)
+
+
+def _driving(effect: Effect, axis: int) -> str | None:
+    """The one covariate that drives an effect on an axis; None where it is not
+    one."""
+    names = [n for n in effect.needs if n not in (DURATION, RUN)] or [n for n in effect.needs if n == RUN]
+    own = [n for n in names if n in (BEFORE[axis], CHANGE[axis], SCATTER[axis])] or names
+    return own[0] if len(own) == 1 else None
+
+
+def _axes_of(covariate: str) -> Sequence[int]:
+    """On which a variable without a name may act: what is an axis's own on that
+    one. The pose before stands for the change too, time since the start for
+    time, and a channel for its lags."""
+    if covariate in (*BEFORE, *SCATTER):
+        return ["xyz".index(covariate[-1])]
+    rate = covariate.endswith(rate_of("")) and not lag_in(covariate)
+    return range(AXES) if covariate == SINCE_START or rate or not is_derived(covariate) else ()
+
+
+def _on_sphere(x: Floats, axis: int, reference: float) -> Floats:
+    """(k,3) readings of the length of the reference, x along the axis and the
+    rest in equal parts along the others."""
+    rest = np.sqrt(np.maximum(reference**2 - x**2, 0.0) / 2)
+    return np.stack([x if i == axis else rest for i in range(AXES)], axis=1)
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """What an effect adds to an axis at the reference, where another axis reads
+    x: (k,p)."""
+
+    effect: Effect
+    index: Ints
+    axis: int
+    other: int
+    reference: float
+
+    def __call__(self, x: Floats) -> Floats:
+        s = np.zeros((len(x), AXES))
+        s[:, self.axis], s[:, self.other] = self.reference, x
+        return np.asarray(self.effect.basis(s, {})[:, self.axis, self.index])
+
+
+@dataclass(frozen=True)
+class _Polynomials:
+    """Legendre's, of these degrees, over a range from ``low`` to ``high``."""
+
+    low: float
+    high: float
+    degrees: tuple[int, ...]
+
+    @classmethod
+    def over(cls, x: Floats, degrees: tuple[int, ...]) -> _Polynomials:
+        return cls(float(x.min()), float(x.max()), degrees)
+
+    def __call__(self, x: Floats) -> Floats:
+        t = (2 * x - self.low - self.high) / max(self.high - self.low, 1e-300)
+        return np.asarray(legendre.legvander(t, max(self.degrees))[:, list(self.degrees)])
+
+
+def _grid(driver: _Driver, x: Floats) -> Floats:
+    return np.unique(x) if driver.variable == RUN else np.linspace(x.min(), x.max(), POINTS)
+
+
+def _same(one: Floats, other: Floats) -> bool:
+    return bool(np.allclose(one, other, rtol=0, atol=SAME * max(float(np.abs(other).max(initial=0.0)), 1e-300)))
+
+
+def _least_squares(columns: Floats, target: Floats) -> Floats:
+    """However different the columns are in size."""
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(columns / size, target, rcond=SAME)[0] / size[:, None])
