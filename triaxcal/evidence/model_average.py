@@ -172,7 +172,7 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
     inverse of their covariance."""
     evidence = posterior.evidence
     rows = evidence.rows
-    scaled = np.zeros(evidence.columns.shape[1])
+    scaled = np.zeros(evidence.columns.count)
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
     for found, weight in zip(posterior.sets, posterior.set_probabilities, strict=True):
         if weight < NEGLIGIBLE_PROBABILITY:
@@ -182,11 +182,11 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
         places = evidence.places(found.members)
         scaled[places] += mean.sum(axis=0)
         for part, of_part, q in zip(found.parts, share, mean, strict=True):
-            by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
+            by_part[part] += of_part * rows.y - evidence.columns.at(places) @ q
     deviation = projection.by_term @ scaled
     residuals: dict[int, Floats] = {}
     for part, target in by_part.items():
-        inverse = np.linalg.inv(evidence.covariance(part))
+        inverse = evidence.precision(part)
         solved = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ inverse @ target)
         deviation[:9] += solved / rows.lengths
         residuals[part] = inverse @ (target - rows.linear @ solved)

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from triaxcald.abort import add_action, discard_action, steer
+from triaxcald.cli.progress import erased
 from triaxcald.printable import printable, printable_json
 from triaxcald.text import waits
 
@@ -26,12 +27,14 @@ if TYPE_CHECKING:  # every command says something, few show poses
 
 def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
     """One JSON document on standard output, nothing else."""
+    erased()
     sys.stdout.write(printable_json(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)) + "\n")
 
 
 def show(line: str) -> None:
     """A line of what came of the work, to standard output; what a file holds
     may be quoted in it, as in `say`."""
+    erased()
     sys.stdout.write(printable(line) + "\n")
 
 
@@ -63,6 +66,7 @@ def say(text: str) -> None:
     What a file holds may be quoted in it: that can neither begin a second line
     nor steer the terminal.
     """
+    erased()
     line = printable(text)
     if len(line) > LINE_MOST:
         line = f"{line[: LINE_MOST // 2]} … {line[-LINE_MOST // 2 :]}"
@@ -74,6 +78,7 @@ def say(text: str) -> None:
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """To standard output; columns of numbers are the caller's text, and a tuple
     has a line for each of its texts."""
+    erased()
     shown = Table(title=printable(title), title_justify="left", header_style="bold")
     for i, name in enumerate(columns):
         shown.add_column(printable(name), justify="left" if i == 0 else "right", overflow="fold")
