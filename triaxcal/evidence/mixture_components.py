@@ -12,7 +12,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
 from triaxcal.evidence.marginal_likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.row_covariance import RowPrecision
+from triaxcal.evidence.row_covariance import RowPrecision, inverse_of
 from triaxcal.model.sensor import LINEAR
 
 NEGLIGIBLE_PROBABILITY = 1e-6
@@ -70,10 +70,11 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
         precision = np.tile(weighted @ design, (len(cells), 1, 1))
         own = np.arange(LINEAR, design.shape[1])
         precision[:, own, own] += sizes**-2.0
-        within = np.linalg.inv(precision)
+        within = inverse_of(precision)
         here = within @ (weighted @ rows.y)
         left = rows.y - here @ design.T
-        noise = np.array([rows.noise_variance_given(float(chi2)) for chi2 in left @ (inverse[part] @ rows.y)])
+        chi2 = np.maximum(left @ (inverse[part] @ rows.y), 0.0)
+        noise = np.array([rows.noise_variance_given(float(of_cell)) for of_cell in chi2])
         names = posterior.names_of(found)
         out.append(Components(found, names, places, part, of, sizes, here, within, noise, left, design, inverse[part]))
     return out

@@ -20,6 +20,7 @@ from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.model_search import likely_sets
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
@@ -133,7 +134,8 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
 
 def _point_of(posterior: Posterior) -> State | None:
     """The parameters of the likeliest model; None where the linearisation holds
-    for them, or where that model has no effect."""
+    for them, where that model has no effect, or where it fits no better there
+    than nothing does: so far the linearisation does not reach."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):
@@ -141,7 +143,7 @@ def _point_of(posterior: Posterior) -> State | None:
     scaled = best.coefficients
     inverse = evidence.precision(best.parts[int(np.argmax(best.by_part))])
     left = inverse @ (rows.y - evidence.columns.at(evidence.places(best.members)) @ scaled)
-    linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)
+    linear = inverse_of(rows.linear.T @ inverse @ rows.linear) @ (rows.linear.T @ left)
     effects, coefficients, predicted = [], [], rows.linear @ linear - rows.y
     ends = np.cumsum([0, *(term.rank for term in terms)])
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
@@ -153,8 +155,11 @@ def _point_of(posterior: Posterior) -> State | None:
             predicted = predicted + rows.by_coefficients(term.effect) @ own
     point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
     try:
-        found, _, _ = linearise_all(rows.problem, point, jacobian=False)
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far is none
+            found = linearise_all(rows.problem, point, jacobian=False)[0] / rows.error
     except Refused:
         return None
-    curved = rows.beyond_linear(found / rows.error - predicted)
+    if not found @ (inverse @ found) < rows.y @ (inverse @ rows.y):
+        return None
+    curved = rows.beyond_linear(found - predicted)
     return point if curved @ curved > evidence.odds.relinearise_chi2 else None

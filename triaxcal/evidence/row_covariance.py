@@ -16,6 +16,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 
+NOTHING = 1e-9
+"""A share of the variance of the noise that shows in no figure."""
+
 
 @dataclass(frozen=True, eq=False)
 class RowPrecision:
@@ -97,12 +100,12 @@ class LowRank:
 
     def precision(self, tau: float) -> RowPrecision:
         """Of noise with a variance of one, and this in units of ``tau``."""
-        return _precision(*self._principal, tau)
+        return _precision(*self._principal(tau), tau)
 
     def precisions_beyond(self, basis: Floats, taus: Sequence[float]) -> list[RowPrecision]:
         """Of what an orthonormal ``basis`` (N,r) leaves, in each of these
         units."""
-        axes, variance = self._left_by(basis)._principal
+        axes, variance = self._left_by(basis)._principal(max(taus))
         whole, taken = np.concatenate([basis, axes], axis=1), np.ones(basis.shape[1])
         each = (_precision(axes, variance, tau) for tau in taus)
         return [replace(left, axes=whole, taken=np.concatenate([taken, left.taken])) for left in each]
@@ -110,13 +113,31 @@ class LowRank:
     def _left_by(self, basis: Floats) -> LowRank:
         return LowRank(self.factor - basis @ (basis.T @ self.factor))
 
-    @cached_property
-    def _principal(self) -> tuple[Floats, Floats]:
-        """Axes (N,k) and the variances (k,) along them."""
+    def _principal(self, tau: float) -> tuple[Floats, Floats]:
+        """Axes (N,k) and the variances (k,) along them, that show in the noise
+        in units of ``tau``."""
         if not self.factor.size:
             return self.factor, np.empty(0)
+        axes, variance = self._all_principal
+        shown = tau**2 * variance > NOTHING
+        return axes[:, shown], variance[shown]
+
+    @cached_property
+    def _all_principal(self) -> tuple[Floats, Floats]:
         axes, size, _ = np.linalg.svd(self.factor, full_matrices=False)
         return axes, size**2
+
+
+def inverse_of(precision: Floats) -> Floats:
+    """(…,d,d) of symmetric matrices (…,d,d). Combinations that the data show no
+    better than rounding keep the width that rounding gives them, which is as
+    good as none known."""
+    size = np.sqrt(np.maximum(np.diagonal(precision, axis1=-2, axis2=-1), np.finfo(float).tiny))
+    scaled = precision / size[..., :, None] / size[..., None, :]
+    value, axes = np.linalg.eigh(scaled)
+    value = np.maximum(value, value.shape[-1] * np.finfo(float).eps)
+    axes = axes / size[..., :, None]
+    return np.asarray((axes / value[..., None, :]) @ np.swapaxes(axes, -1, -2))
 
 
 def _precision(axes: Floats, variance: Floats, tau: float) -> RowPrecision:
