@@ -157,9 +157,9 @@ def _point_of(posterior: Posterior) -> State | None:
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a step too far is none
             found = linearise_all(rows.problem, point, jacobian=False)[0] / rows.error
+            if not found @ (inverse @ found) < rows.y @ (inverse @ rows.y):
+                return None
     except Refused:
-        return None
-    if not found @ (inverse @ found) < rows.y @ (inverse @ rows.y):
         return None
     curved = rows.beyond_linear(found - predicted)
     return point if curved @ curved > evidence.odds.relinearise_chi2 else None
