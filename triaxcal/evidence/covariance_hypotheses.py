@@ -45,8 +45,8 @@ def parts_of(rows: LinearisedData, odds: Odds) -> list[UnmodelledPart]:
 class WeightedData:
     """The data under one part, less what the nine parameters take: the
     ``precision`` of the rows beyond these, the terms' ``columns`` by the
-    weights of that, and their products (D+N,k) ``along`` its axes, the misfits
-    ``left`` (N,)."""
+    weights of that, and the products (D,k) of their base ``along`` its axes,
+    the misfits ``left`` (N,)."""
 
     precision: RowPrecision
     weighted: WeightedColumns
@@ -78,8 +78,12 @@ class WeightedData:
 
     @cached_property
     def _block_products(self) -> Floats:
-        taken = self.along * np.sqrt(self.precision.taken)
-        return np.asarray(self.weighted.block_products - self.columns.block_products(taken))
+        whole, precision = self.weighted.block_products, self.precision
+        return np.asarray(whole - self.columns.block_products(self.along, precision.axes, precision.taken))
+
+    def _along(self, places: Ints) -> Floats:
+        """(q,k) of these scaled coefficients' columns, unscaled."""
+        return self.columns.along_of(self.columns.place[places], self.along, self.precision.axes)
 
     def information(self, places: Ints) -> Floats:
         """(t,q,q) of terms with coefficients at ``places`` (t,q), one by one."""
@@ -87,15 +91,16 @@ class WeightedData:
 
     def normal_equations(self, places: Ints) -> tuple[Floats, Floats]:
         """Information (q,q) and score (q,) of these scaled coefficients."""
-        along = self.along[self.columns.place[places]] * self.columns.factor[places][:, None]
+        along = self._along(places) * self.columns.factor[places][:, None]
         return self.weighted.among(places) - (along * self.precision.taken) @ along.T, self.score[places]
 
     def crossed(self, places: Ints) -> Floats:
         """(q,C) the information that these scaled coefficients have in common
         with all."""
         place, factor = self.columns.place, self.columns.factor
+        taken = self._along(places) * self.precision.taken
         whole = self.weighted.with_all(place[places])
-        whole = whole - (self.along[place[places]] * self.precision.taken) @ self.along.T
+        whole = whole - np.concatenate([taken @ self.along.T, taken @ self.precision.axes.T], axis=1)
         return np.asarray(factor[places][:, None] * whole[:, place] * factor)
 
     def beside(self, places: Ints, scale: Floats) -> ConditionalData:
@@ -165,7 +170,7 @@ def weighted(parts: Sequence[UnmodelledPart], columns: TermColumns, rows: Linear
         alike = isinstance(of_rows, LowRank)
         along: Floats | None = None
         for precision in of_rows.precisions_beyond(rows.basis, of_kind):
-            along = along if along is not None and alike else beyond.against(precision.axes)
+            along = along if along is not None and alike else beyond.base.T @ precision.axes
             of_part = unweighted if alike else WeightedColumns(beyond, precision.weight)
             out.append(WeightedData(precision, of_part, along, rows.left))
     return out

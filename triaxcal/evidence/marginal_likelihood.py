@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,12 +66,16 @@ class Evidence:
 
     def __init__(self, rows: LinearisedData, terms: Sequence[Term], odds: Odds) -> None:
         """Sizes begin at that share of the noise of a pose which the odds have."""
-        self.rows, self.terms, self.odds = rows, terms, odds
+        self.rows, self.odds = rows, odds
+        self.columns = TermColumns.of([term.columns for term in terms], len(rows.y))
+        self.terms = [
+            replace(term, columns=columns)
+            for term, columns in zip(terms, self.columns.shared([term.columns for term in terms]), strict=True)
+        ]
         self.parts = parts_of(rows, odds)
         self._begin_sizes(odds.smallest * rows.median_standard_error)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
-        self.columns = TermColumns.of([term.columns for term in terms], len(rows.y))
         self._data = weighted(self.parts, self.columns, rows)
         ranks = np.array([term.rank for term in terms], dtype=int)
         self._by_rank: list[tuple[Ints, Ints]] = []

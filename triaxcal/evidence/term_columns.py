@@ -4,8 +4,8 @@ there twice, and none is longer than it has to be."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -67,6 +67,15 @@ class TermColumns:
         blocks = [np.array([own for own in together if len(own) == width]) for width in widths]
         return cls(np.concatenate([np.empty((rows, 0)), *sources], axis=1), place, factor, blocks)
 
+    def shared(self, terms: Sequence[ScaledColumns]) -> Iterator[ScaledColumns]:
+        """The columns of the same terms, with the base as their source: their
+        own need not be kept."""
+        at = 0
+        for term in terms:
+            place = self.place[at : at + term.rank]
+            at += term.rank
+            yield term if term.source is None else replace(term, source=self.base, index=place)
+
     @property
     def count(self) -> int:
         return len(self.place)
@@ -97,13 +106,20 @@ class TermColumns:
             out[block] = np.arange(block.shape[1])
         return out
 
-    def block_products(self, along: Floats) -> Floats:
-        """(D+N,p) of columns that are known by (D+N,k) numbers each, the
-        products with those of their block."""
-        out = np.zeros((len(along), max((b.shape[1] for b in self.blocks), default=0)))
+    def block_products(self, along: Floats, axes: Floats, taken: Floats) -> Floats:
+        """(D+N,p) of the columns the products with those of their block, by
+        these shares ``taken`` (k,) of what they have along ``axes`` (N,k):
+        ``along`` (D,k) are those of the base."""
+        out = np.zeros((sum(self.base.shape), max((b.shape[1] for b in self.blocks), default=0)))
         for block in self.blocks:
-            own = along[block]
-            out[block, : block.shape[1]] = own @ own.transpose(0, 2, 1)
+            own = self.along_of(block, along, axes)
+            out[block, : block.shape[1]] = (own * taken) @ own.transpose(0, 2, 1)
+        return out
+
+    def along_of(self, place: Ints, along: Floats, axes: Floats) -> Floats:
+        """(…,k) of the columns at these places, likewise."""
+        out, single = np.empty((*place.shape, axes.shape[1])), place >= len(along)
+        out[~single], out[single] = along[place[~single]], axes[place[single] - len(along)]
         return out
 
     def of_blocks(self, products: Floats, places: Ints) -> Floats:
