@@ -215,10 +215,9 @@ class _CellPredictions:
         gain = self.gain[:, :, at]
         crossed = self.covariance[:, at[:, None], self.taken]
         own = self.covariance[:, at[:, None], at]
-        size, axes = self._principal(own - crossed @ gain)
-        root = (axes * np.sqrt(size)[:, None])[truth]
+        lower = _lower(*self._principal(own - crossed @ gain))[truth]
         mean = self.mean[truth[:, None], at] + np.einsum("sk,skr->sr", self.off, gain[truth])
-        return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", root, self.normal)], axis=1)
+        return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", lower, self.normal)], axis=1)
 
     def weight(self, pose: int, shown: Floats) -> Floats:
         """(C,S) of the cells after this pose too: by products of the precision
@@ -235,6 +234,14 @@ class _CellPredictions:
         log = own[:, None] - 0.5 * squares
         weight = np.exp(log - log.max(axis=0))
         return np.asarray(weight / weight.sum(axis=0))
+
+
+def _lower(size: Floats, axes: Floats) -> Floats:
+    """(C,k,k) the Cholesky factors of covariances with these variances and axes,
+    however different the variances are."""
+    upper: Floats = np.asarray(np.linalg.qr((axes * np.sqrt(size)[:, None]).transpose(0, 2, 1), mode="r"))
+    sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
+    return np.asarray((upper * sign[:, :, None]).transpose(0, 2, 1))
 
 
 def _entropy(p: Floats) -> Floats:
