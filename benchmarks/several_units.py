@@ -58,7 +58,7 @@ def poses_of(rng: np.random.Generator, name: str, along: np.ndarray | None) -> l
         return made(None)
     bare = made(None)
     rows = LinearisedData.of(bare, fit(bare, signs=SIGNS), SIGNS)
-    shown = rows.complement.T @ rows.by_coefficients(effect_named(name)) @ along
+    shown = rows.beyond_linear(rows.by_coefficients(effect_named(name)) @ along)
     return made(along * STRENGTH / float(np.linalg.norm(shown)))
 
 

@@ -29,6 +29,7 @@ from triaxcal.evidence.refinement import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
+from triaxcal.progress import Progress, Stage, untold
 from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
@@ -180,6 +181,7 @@ def diagnose(
     catalogue: Sequence[Effect] | None = None,
     at: Moment | float = Moment.END,
     odds: Odds | None = None,
+    progress: Progress = untold,
 ) -> Loop:
     """Find and correct the effects that still poses show beyond the linear
     model.
@@ -188,14 +190,17 @@ def diagnose(
     poses' channels where it is None. ``check`` are poses of another recording,
     for the held-out error. ``at`` is the moment of the recording for which the
     calibration holds elsewhere: a number in seconds from the first sample.
-    Raises as `triaxcal.estimate.pose_fit.fit` does.
+    ``progress`` is called as the work goes on. Raises as
+    `triaxcal.estimate.pose_fit.fit` does.
     """
+    progress(Stage.FIT)
     linear = fit(poses, signs=signs, reference=reference)
     sound = [p for p in poses if not p.fault]
     moment = HoldsAt.of(sound, at)
     if moment is None:
         raise Refused("no pose without a fault")
-    posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds)
+    posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds, progress=progress)
+    progress(Stage.ERRORS)
     before = replace(_without_outliers(poses, linear, signs, posterior), holds_at=moment)
     effects = considered(poses, catalogue)
     faulty = faults_of(posterior.evidence.rows, effects)

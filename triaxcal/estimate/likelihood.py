@@ -63,6 +63,10 @@ class SlopeData(Protocol):
 
     def only(self, rows: Ints | slice) -> Self: ...
 
+    def asked_at(self, inside: Problem) -> Self:
+        """With other outputs at the places that are asked."""
+        ...
+
     def widened(self, factor: Floats) -> Self:
         """With errors so many times (n,) as large."""
         ...

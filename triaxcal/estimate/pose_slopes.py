@@ -87,6 +87,9 @@ class PoseSlopes:
         slope = PLACES / (PLACES @ PLACES)
         return np.tensordot(slope, values.reshape(len(slope), -1, *values.shape[1:]), 1)
 
+    def asked_at(self, inside: Problem) -> PoseSlopes:
+        return replace(self, inside=inside)
+
     def widened(self, factor: Floats) -> PoseSlopes:
         return replace(self, widening=self.widening * factor)
 

@@ -55,7 +55,16 @@ class Spread:
             prior += size
             if cells.names & (THERMAL - listed):
                 thermal += here
-        return cls(whole / total, thermal / total, prior / total)
+        return cls(_sound(whole / total), _sound(thermal / total), prior / total)
+
+
+def _sound(covariance: Floats) -> Floats:
+    """Where combinations are hardly known, rounding may leave less than nothing
+    of the others."""
+    if (np.diag(covariance) >= 0).all():
+        return covariance
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
 
 
 def _moments(

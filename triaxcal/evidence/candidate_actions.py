@@ -187,8 +187,8 @@ def _suspects(posterior: Posterior) -> list[int]:
     """Poses that may be outliers, and then those that are far off the linear
     fit."""
     rows, outlier = posterior.evidence.rows, posterior.outlier_probabilities
-    spread = np.linalg.norm(rows.complement, axis=1)
-    off = np.abs(rows.complement @ rows.z / np.maximum(spread, 1e-9))[: rows.n]
+    spread = np.sqrt(np.maximum(1 - np.sum(rows.basis**2, axis=1), 0.0))
+    off = np.abs(rows.left / np.maximum(spread, 1e-9))[: rows.n]
     found = [i for i in range(rows.n) if outlier[i] >= UNDECIDED_PROBABILITY or off[i] >= FAR]
     return sorted(found, key=lambda i: (outlier[i] < UNDECIDED_PROBABILITY, -off[i]))[:AGAIN]
 

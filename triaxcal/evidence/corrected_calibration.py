@@ -43,7 +43,7 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibra
         channel_reference={name: rows.problem.channel_reference[name] for name in needed},
         birge_ratio=1.0,
         excess_g=0.0,
-        dof=rows.noise.students_dof + len(rows.z),
+        dof=rows.noise.students_dof + rows.residual_dof,
         slopes=rows.slopes,
         # What residuals show beyond noise is in the covariance, by the
         # probability of whatever may have made it.

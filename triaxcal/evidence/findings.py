@@ -96,7 +96,7 @@ def _unexplained(posterior: Posterior) -> Unexplained:
     variance = 0.0
     for p, part in zip(posterior.part_probabilities, posterior.evidence.parts, strict=True):
         if part.kind is not None and part.kind.what is not UnmodelledKind.WITHIN_POSE:
-            squares = np.diag(part.kind.covariance)[: rows.n] * rows.error[: rows.n] ** 2
+            squares = part.kind.of_rows.variances[: rows.n] * rows.error[: rows.n] ** 2
             variance += float(p) * part.tau**2 * float(np.mean(squares))
     likeliest = next(
         (what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE), None

@@ -48,12 +48,13 @@ def not_identifiable(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping
 def _in_full(evidence: Evidence, name: str) -> bool:
     """Whether no combination of all the coefficients of some shape looks like
     the nine parameters."""
-    complement = evidence.rows.complement.T
+    rows = evidence.rows
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
-            columns = term.columns / np.maximum(np.linalg.norm(term.columns, axis=0), 1e-300)
-            left = complement @ columns
-            if min(left.shape) == term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
+            columns = np.asarray(term.columns)
+            columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+            left = rows.beyond_linear(columns)
+            if rows.residual_dof >= term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
                 return True
     return False
 

@@ -10,7 +10,7 @@ information for its cost.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,9 @@ to one. Less is not worth a pose."""
 MOST = 6
 """Poses at a time: what they show then tells so much that the draws are too few
 for one more."""
+AT_ONCE = 16
+"""Poses that are predicted together: what each cell says of all of them is a
+matrix of all their rows."""
 ALIKE = 0.02
 """Actions that bring as much but for this share are alike, and the first of
 them is chosen: so much is the chance of the draws, and no processor's rounding
@@ -143,25 +146,31 @@ class _PredictiveDraws:
     def take(self, options: Options, again: int | None = None) -> bool:
         """The best action of all, if it is worth its cost; or the best that
         takes a pose ``repeat_of``, whatever that is worth."""
-        found = options.after(self.poses)
-        rows = options.rows.of_future_poses([*self.poses, *(pose for _, pose in found)])
-        predictions = _CellPredictions(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
-        gain = np.empty(len(found))
-        for i in range(len(found)):
-            shown = predictions.shown_with(len(self.poses) + i)
-            gain[i] = self.entropy_after - self._entropy_of(predictions.weight(len(self.poses) + i, shown))
-        rate = gain / [action.cost for action, _ in found]
+        found, gain = options.after(self.poses), list[float]()
+        normal = self.rng.standard_normal((DRAWS, 2 if options.rows.slopes else 1))
+
+        def predictions(of: Sequence[tuple[Action, Pose]]) -> _CellPredictions:
+            rows = options.rows.of_future_poses([*self.poses, *(pose for _, pose in of)])
+            return _CellPredictions(self, rows, normal)
+
+        for first in range(0, len(found), AT_ONCE):
+            some = predictions(found[first : first + AT_ONCE])
+            for i in range(len(self.poses), some.rows.n):
+                weight = some.weight(i, some.shown_with(i))
+                gain.append(self.entropy_after - self._entropy_of(weight))
+        rate = np.array(gain) / [action.cost for action, _ in found]
         if again is not None:
             rate[[action.kind is not ActionKind.REPEAT or action.repeat_of != again for action, _ in found]] = -np.inf
         best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
         if again is None and rate[best] < LEAST:
             return False
-        self.shown = predictions.shown_with(len(self.poses) + best)
-        self.weight = predictions.weight(len(self.poses) + best, self.shown)
+        chosen = predictions([found[best]])
+        self.shown = chosen.shown_with(len(self.poses))
+        self.weight = chosen.weight(len(self.poses), self.shown)
         action, pose = found[best]
-        self.actions.append(replace(action, information=float(gain[best])))
+        self.actions.append(replace(action, information=gain[best]))
         self.poses.append(pose)
-        self.entropy_after -= float(gain[best])
+        self.entropy_after -= gain[best]
         return True
 
     def if_it_acts(self, name: str, p: float) -> float:
@@ -181,6 +190,7 @@ class _CellPredictions:
     def __init__(self, future: _PredictiveDraws, rows: LinearisedData, normal: Floats) -> None:
         self.future, self.rows, self.normal = future, rows, normal
         self.mean, self.covariance = future.cells.predicted(rows)
+        self.noise = np.concatenate([cells.noise for cells in future.cells.mixture])
         self.taken = self._places(range(len(future.poses)))
         inner = self.covariance[:, self.taken[:, None], self.taken]
         self.gain = np.linalg.solve(inner, self.covariance[:, self.taken])
@@ -191,13 +201,21 @@ class _CellPredictions:
         index = np.array(list(poses), dtype=int)[:, None]
         return np.ravel([index, index + self.rows.n] if self.rows.slopes else index, order="F")
 
+    def _principal(self, covariance: Floats) -> tuple[Floats, Floats]:
+        """Variances (C,k) and axes (C,k,k) of covariances (C,k,k) of rows to
+        come. None is less than the noise, whatever rounding leaves of it beside
+        what is hardly known."""
+        size, axes = np.linalg.eigh(covariance)
+        return np.maximum(size, self.noise[:, None]), axes
+
     def shown_with(self, pose: int) -> Floats:
         """(S,K) what was shown and what this pose shows, by the cell that is
         true in each draw."""
         at, truth = self._places([pose]), self.future.truth
         gain = self.gain[:, :, at]
         crossed = self.covariance[:, at[:, None], self.taken]
-        lower = np.linalg.cholesky(self.covariance[:, at[:, None], at] - crossed @ gain)[truth]
+        own = self.covariance[:, at[:, None], at]
+        lower = _lower(*self._principal(own - crossed @ gain))[truth]
         mean = self.mean[truth[:, None], at] + np.einsum("sk,skr->sr", self.off, gain[truth])
         return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", lower, self.normal)], axis=1)
 
@@ -206,14 +224,24 @@ class _CellPredictions:
         of each cell with the squares of what is shown, one product of matrices
         for all draws."""
         at = np.concatenate([self.taken, self._places([pose])])
-        mean, precision = self.mean[:, at], np.linalg.inv(self.covariance[:, at[:, None], at])
+        own = self.covariance[:, at[:, None], at]
+        size, axes = self._principal(own)
+        mean, precision = self.mean[:, at], (axes / size[:, None]) @ axes.transpose(0, 2, 1)
         scored = np.einsum("cij,cj->ci", precision, mean)
         pairs = (shown[:, :, None] * shown[:, None]).reshape(len(shown), -1)
         squares = precision.reshape(len(mean), -1) @ pairs.T - 2 * scored @ shown.T
-        own = np.log(self.future.cells.weight) + 0.5 * (np.linalg.slogdet(precision)[1] - np.sum(scored * mean, axis=1))
+        own = np.log(self.future.cells.weight) + 0.5 * (-np.log(size).sum(axis=1) - np.sum(scored * mean, axis=1))
         log = own[:, None] - 0.5 * squares
         weight = np.exp(log - log.max(axis=0))
         return np.asarray(weight / weight.sum(axis=0))
+
+
+def _lower(size: Floats, axes: Floats) -> Floats:
+    """(C,k,k) the Cholesky factors of covariances with these variances and axes,
+    however different the variances are."""
+    upper: Floats = np.asarray(np.linalg.qr((axes * np.sqrt(size)[:, None]).transpose(0, 2, 1), mode="r"))
+    sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
+    return np.asarray((upper * sign[:, :, None]).transpose(0, 2, 1))
 
 
 def _entropy(p: Floats) -> Floats:

@@ -38,11 +38,11 @@ class LinearisedData:
     ``places`` (n,) are those of the poses among all that were given. ``y`` (N,)
     misfits, ``linear`` (N,9) derivatives by the nine parameters with columns of
     length one, ``lengths`` (9,) what they were divided by, ``error`` (N,)
-    standard errors in units of the reference. ``complement`` (N,m) is an
-    orthonormal basis of what the nine leave, m = N − 9, and ``z`` (m,) the
-    misfits in it. ``run`` (n,) is the recording that each pose is of. ``point``
-    is where all was linearised, with effects where these are large, and
-    ``state`` its nine parameters.
+    standard errors in units of the reference. ``basis`` (N,9) is an orthonormal
+    basis of what the nine take, and ``left`` (N,) the misfits without that.
+    ``run`` (n,) is the recording that each pose is of. ``point`` is where all
+    was linearised, with effects where these are large, and ``state`` its nine
+    parameters.
     """
 
     poses: Sequence[Pose]
@@ -54,8 +54,8 @@ class LinearisedData:
     linear: Floats
     lengths: Floats
     error: Floats
-    complement: Floats
-    z: Floats
+    basis: Floats
+    left: Floats
     noise: NoiseLevels
     likelihood: Floats
 
@@ -82,7 +82,8 @@ class LinearisedData:
 
     @classmethod
     def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> LinearisedData:
-        r, J, error = linearise_all(problem, point)
+        r, _, error = linearise_all(problem, point)
+        _, J, _ = linearise_all(in_attitude(problem, point), point)
         r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
         if len(r) <= LINEAR:
             raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
@@ -90,15 +91,15 @@ class LinearisedData:
         columns = J / error[:, None]
         lengths = np.linalg.norm(columns, axis=0)
         columns = columns / lengths
-        complement = np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
+        basis = span(columns)
         y, noise = -r / error, noise_levels(poses)
-        likelihood = noise.log_likelihood(np.exp(CHI2_LOG), complement.shape[1])
-        run, z = np.array([p.run.index for p in poses]), complement.T @ y
-        return cls(poses, places, run, problem, point, y, columns, lengths, error, complement, z, noise, likelihood)
+        likelihood = noise.log_likelihood(np.exp(CHI2_LOG), len(y) - basis.shape[1])
+        run, left = np.array([p.run.index for p in poses]), y - basis @ (basis.T @ y)
+        return cls(poses, places, run, problem, point, y, columns, lengths, error, basis, left, noise, likelihood)
 
     def of_future_poses(self, poses: Sequence[Pose]) -> LinearisedData:
         """Of poses that nobody has taken, about the same point and in the same
-        units: misfits are not known, and nothing is ``complement``."""
+        units: misfits are not known, and there is no ``basis``."""
         sensor = self.state.sensor(self.problem)
         every = channels_of([*self.poses, *poses], self.problem.channel_reference)
         channels = {name: values[self.n :] for name, values in every.items()}
@@ -110,7 +111,8 @@ class LinearisedData:
             slopes=None,
         )
         problem = replace(problem, slopes=PoseSlopes.of(problem, poses) if self.slopes else None)
-        _, J, error = linearise_all(problem, self.point)
+        _, _, error = linearise_all(problem, self.point)
+        _, J, _ = linearise_all(in_attitude(problem, self.point), self.point)
         nothing = np.empty((len(error), 0))
         return replace(
             self,
@@ -121,9 +123,18 @@ class LinearisedData:
             y=np.full(len(error), np.nan),
             linear=J[:, :LINEAR] / error[:, None] / self.lengths,
             error=error,
-            complement=nothing,
-            z=np.empty(0),
+            basis=nothing,
+            left=np.empty(0),
         )
+
+    def beyond_linear(self, columns: Floats) -> Floats:
+        """(N,…) what the nine parameters leave of columns."""
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns))
+
+    @property
+    def residual_dof(self) -> int:
+        """Degrees of freedom that the nine parameters leave."""
+        return len(self.y) - int(self.basis.shape[1])
 
     def by_coefficients(self, effect: Effect) -> Floats:
         """(N,p) derivatives of the rows by the coefficients of an effect."""
@@ -144,7 +155,8 @@ class LinearisedData:
     def _radii(self) -> list[tuple[Problem, Radius]]:
         """Where effects are asked: in the means, and inside the poses where
         these know their slopes."""
-        problems = [self.problem, *([] if self.problem.slopes is None else [self.problem.slopes.inside])]
+        there = in_attitude(self.problem, self.point)
+        problems = [there, *([] if there.slopes is None else [there.slopes.inside])]
         return [(p, self.point.sensor(p).radius(p.u, p.covariates)) for p in problems]
 
     @property
@@ -185,12 +197,38 @@ class LinearisedData:
         """The mean variance of the noise over the one stated, where a model
         leaves this sum of squares."""
         known = self.noise.students_dof
-        return (known + chi2) / (known + len(self.z))
+        return (known + chi2) / (known + self.residual_dof)
 
     def log_likelihood(self, chi2: Floats) -> Floats:
         """Of sums of squares in m degrees of freedom (any shape), but for a
         constant; the size of the noise is known as far as the poses tell it."""
         return np.interp(np.log(np.maximum(chi2, 1e-3)), CHI2_LOG, self.likelihood)
+
+
+def in_attitude(problem: Problem, point: State) -> Problem:
+    """The same poses, at all places, with the outputs that the model has in
+    their attitudes, where |a| is the reference.
+
+    Derivatives are those there. At the measured outputs they would know the
+    misfits: a constant, which is no more than nine parameters make of it, would
+    differ from that by what each pose is off, and terms that hold a little of
+    one would seem to fit whatever there is.
+    """
+
+    def there(of: Problem) -> Problem:
+        sensor = point.sensor(of)
+        up = sensor.up(of.u, of.covariates)
+        return replace(of, u=sensor.output(up * of.reference, of.covariates))
+
+    slopes = problem.slopes
+    return replace(there(problem), slopes=slopes and slopes.asked_at(there(slopes.inside)))
+
+
+def span(columns: Floats) -> Floats:
+    """(N,r) an orthonormal basis of what columns (N,p) span, but for what
+    rounding makes of columns that depend on each other."""
+    axes, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(axes[:, size > max(columns.shape) * np.finfo(float).eps * size[0]])
 
 
 def _not_too_quiet(error: Floats) -> Floats:

@@ -12,16 +12,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp, softmax
-from triaxcal.evidence.covariance_hypotheses import ConditionalData, diagonalised, parts_of
+from triaxcal.evidence.covariance_hypotheses import ConditionalData, parts_of, shown, weighted
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.row_covariance import LowRank, RowPrecision
+from triaxcal.evidence.term_columns import TermColumns
 from triaxcal.evidence.terms import Term
 
 
@@ -64,13 +66,17 @@ class Evidence:
 
     def __init__(self, rows: LinearisedData, terms: Sequence[Term], odds: Odds) -> None:
         """Sizes begin at that share of the noise of a pose which the odds have."""
-        self.rows, self.terms, self.odds = rows, terms, odds
+        self.rows, self.odds = rows, odds
+        self.columns = TermColumns.of([term.columns for term in terms], len(rows.y))
+        self.terms = [
+            replace(term, columns=columns)
+            for term, columns in zip(terms, self.columns.shared([term.columns for term in terms]), strict=True)
+        ]
         self.parts = parts_of(rows, odds)
         self._begin_sizes(odds.smallest * rows.median_standard_error)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
-        self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
-        self._data = diagonalised(self.parts, rows.complement.T @ self.columns, rows.z)
+        self._data = weighted(self.parts, self.columns, rows)
         ranks = np.array([term.rank for term in terms], dtype=int)
         self._by_rank: list[tuple[Ints, Ints]] = []
         for rank in np.unique(ranks):
@@ -89,11 +95,11 @@ class Evidence:
         other._begin_sizes(smallest_g)
         return other
 
-    def covariance(self, part: int) -> Floats:
-        """(N,N) of the rows over their errors: noise and unmodelled part."""
+    def precision(self, part: int) -> RowPrecision:
+        """Of the rows over their errors: noise and unmodelled part."""
         assumed = self.parts[part]
-        noise = np.eye(len(self.rows.y))
-        return noise if assumed.kind is None else noise + assumed.tau**2 * assumed.kind.covariance
+        of_rows = LowRank(np.empty((len(self.rows.y), 0))) if assumed.kind is None else assumed.kind.of_rows
+        return of_rows.precision(assumed.tau)
 
     def places(self, members: Sequence[int]) -> Ints:
         """Where the scaled coefficients of these terms stand among those of
@@ -119,6 +125,28 @@ class Evidence:
         alone = float(self.rows.log_likelihood(np.array(given.chi2))) + base
         return out + base - np.log(len(self.sizes)), alone
 
+    def explained_without(
+        self,
+        part: int,
+        members: Sequence[int],
+        sizes: Sequence[float],
+        term: tuple[int, float],
+        outliers: Sequence[int],
+    ) -> Floats:
+        """(o,) by how much a term of this size lowers the sum of squares beside
+        ``members`` of given sizes, without the rows of each of the
+        ``outliers``."""
+        given = self._conditional_on(part, members, sizes)
+        own, rows = self.places([term[0]]), np.array([self.places([i]) for i in outliers])
+        crossed = given.crossed(own)[:, rows].transpose(1, 0, 2)
+        rest = np.linalg.pinv(given.information(rows), hermitian=True)
+        through = crossed @ rest
+        information, score = given.normal_equations(own)
+        information = information - through @ crossed.transpose(0, 2, 1)
+        score = score - np.einsum("oqr,or->oq", through, given.score[rows])
+        shrunk = np.linalg.inv(np.eye(len(own)) / term[1] ** 2 + information)
+        return np.asarray(np.einsum("oq,oqp,op->o", score, shrunk, score))
+
     def normal_equations(
         self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
     ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
@@ -126,7 +154,7 @@ class Evidence:
         coefficients beside ``members`` of these sizes, and the sum of squares
         that these leave."""
         given = self._conditional_on(part, members, sizes)
-        return {i: given.normal_equations(slice(self._ends[i], self._ends[i + 1])) for i in each}, given.chi2
+        return {i: given.normal_equations(self.places([i])) for i in each}, given.chi2
 
     def _conditional_on(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> ConditionalData:
         """What ``members`` of these sizes leave under a part."""
@@ -178,7 +206,7 @@ def _marginalised(
         return nothing, nothing, np.zeros((len(score), 1, 0))
     r, squared = ranks[0], grids[0][:, None] ** 2
     value, axes = np.linalg.eigh(information[:, :r, :r])
-    spread = 1 + squared * np.maximum(value, 0.0)[:, None]
+    spread = 1 + squared * shown(value)[:, None]
     shrunk = squared / spread
     along = np.einsum("pqr,pq->pr", axes, score[:, :r])
     gain, log_det = np.sum(shrunk * along[:, None] ** 2, axis=2), np.log(spread).sum(axis=2)

@@ -12,6 +12,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
 from triaxcal.evidence.marginal_likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.row_covariance import RowPrecision, inverse_of
 from triaxcal.model.sensor import LINEAR
 
 NEGLIGIBLE_PROBABILITY = 1e-6
@@ -42,7 +43,7 @@ class Components:
     noise: Floats
     residuals: Floats
     design: Floats
-    inverse: Floats
+    inverse: RowPrecision
 
 
 def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
@@ -55,24 +56,25 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
     for log_share, found, row, cell in _likely_cells(posterior, share):
         sets[id(found)] = found
         together[id(found), row].append((np.exp(log_share), cell))
-    inverse: dict[int, Floats] = {}
+    inverse: dict[int, RowPrecision] = {}
     out = []
     for (key, row), cells in together.items():
         found = sets[key]
         part, places = found.parts[row], evidence.places(found.members)
         if part not in inverse:
-            inverse[part] = np.linalg.inv(evidence.covariance(part))
-        design = np.concatenate([rows.linear, evidence.columns[:, places]], axis=1)
+            inverse[part] = evidence.precision(part)
+        design = np.concatenate([rows.linear, evidence.columns.at(places)], axis=1)
         weighted = design.T @ inverse[part]
         of, chosen = np.array([p for p, _ in cells]), [cell for _, cell in cells]
         sizes = np.repeat(found.sizes[chosen], [evidence.terms[i].rank for i in found.members], axis=1)
         precision = np.tile(weighted @ design, (len(cells), 1, 1))
         own = np.arange(LINEAR, design.shape[1])
         precision[:, own, own] += sizes**-2.0
-        within = np.linalg.inv(precision)
+        within = inverse_of(precision)
         here = within @ (weighted @ rows.y)
         left = rows.y - here @ design.T
-        noise = np.array([rows.noise_variance_given(float(chi2)) for chi2 in left @ (inverse[part] @ rows.y)])
+        chi2 = np.maximum(left @ (inverse[part] @ rows.y), 0.0)
+        noise = np.array([rows.noise_variance_given(float(of_cell)) for of_cell in chi2])
         names = posterior.names_of(found)
         out.append(Components(found, names, places, part, of, sizes, here, within, noise, left, design, inverse[part]))
     return out

@@ -23,6 +23,7 @@ from triaxcal.evidence.average_spread import Spread
 from triaxcal.evidence.mixture_components import NEGLIGIBLE_PROBABILITY, Components, components
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.reported_parameters import Projection
+from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.rounding import reaches
@@ -172,7 +173,7 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
     inverse of their covariance."""
     evidence = posterior.evidence
     rows = evidence.rows
-    scaled = np.zeros(evidence.columns.shape[1])
+    scaled = np.zeros(evidence.columns.count)
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
     for found, weight in zip(posterior.sets, posterior.set_probabilities, strict=True):
         if weight < NEGLIGIBLE_PROBABILITY:
@@ -181,13 +182,14 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
         mean = share[:, None] * found.mean
         places = evidence.places(found.members)
         scaled[places] += mean.sum(axis=0)
+        columns = evidence.columns.at(places)
         for part, of_part, q in zip(found.parts, share, mean, strict=True):
-            by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
+            by_part[part] += of_part * rows.y - columns @ q
     deviation = projection.by_term @ scaled
     residuals: dict[int, Floats] = {}
     for part, target in by_part.items():
-        inverse = np.linalg.inv(evidence.covariance(part))
-        solved = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ inverse @ target)
+        inverse = evidence.precision(part)
+        solved = inverse_of(rows.linear.T @ inverse @ rows.linear) @ (rows.linear.T @ inverse @ target)
         deviation[:9] += solved / rows.lengths
         residuals[part] = inverse @ (target - rows.linear @ solved)
     return deviation, residuals
@@ -199,9 +201,15 @@ def _where_linearised(posterior: Posterior, deviation: Floats, projection: Proje
     rows = posterior.evidence.rows
     wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
     state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)
+    nearest, found = np.inf, state
     for _ in range(STEPS):
-        r, _, _ = linearise_all(rows.problem, state, jacobian=False)
-        step = np.linalg.lstsq(rows.linear, wanted - r / rows.error, rcond=None)[0] / rows.lengths
+        with np.errstate(over="ignore", invalid="ignore"):  # where the poses show too little it may go anywhere
+            r, _, _ = linearise_all(rows.problem, state, jacobian=False)
+            off = rows.basis.T @ (wanted - r / rows.error)
+            if not np.linalg.norm(off) < nearest:
+                return found
+        nearest, found = float(np.linalg.norm(off)), state
+        step = np.linalg.lstsq(rows.linear, rows.basis @ off, rcond=None)[0] / rows.lengths
         state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), projection.effects)
     return state
 

@@ -3,7 +3,7 @@ best (Occam's window)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 
+SINGLES, LARGER = 0.3, 0.8
+"""Shares of the work, about, at which the sets of one term are reckoned, and
+all roughly."""
 Scores = dict[tuple[int, ...], float]
 LEADERS = (12, 6)
 """Sets of one term that are grown, and of more: two by each choice of names,
@@ -27,16 +30,20 @@ NO_PART = 1e-3
 """A part with a smaller share in every leading set is left out of the sums."""
 
 
-def likely_sets(evidence: Evidence) -> list[SetEvidence]:
-    """Those within the window, the best first; the empty one is among them."""
-    every = range(len(evidence.parts))
-    singles = [evidence.log_evidence_with_each(part) for part in every]
+def likely_sets(evidence: Evidence, told: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
+    """Those within the window, the best first; the empty one is among them.
+    ``told`` is called with about the share of the work that is done."""
+    singles = []
+    for part in range(len(evidence.parts)):
+        singles.append(evidence.log_evidence_with_each(part))
+        told(SINGLES * part / len(evidence.parts))
     of_each = log_sum_exp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
     level: Scores = {(i,): float(score) for i, score in enumerate(of_each)}
     scores: Scores = {(): float(log_sum_exp([alone for _, alone in singles]))} | level
     for depth in range(1, evidence.odds.together):
         level = _grown(evidence, level, depth)
         scores |= level
+        told(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
     window = max(scores.values()) - np.log(evidence.odds.window)
     ranked = sorted(scores, key=lambda members: -scores[members])
     kept = [m for m in ranked if scores[m] > window - (ROUGH if len(m) > 1 else 0.0)][:MOST]

@@ -23,6 +23,9 @@ their names, and not that of their last bits."""
 PARTS = 3
 """Unmodelled parts beside which a name is asked about without a pose, the
 likeliest beside the name."""
+LEFT_OUT = 200
+"""Poses at most without which a name is asked about: of more, any one decides
+little."""
 ALTERNATIVES = 8
 """Names at most among which alternatives are looked for, the likeliest."""
 
@@ -174,7 +177,7 @@ class Posterior:
     def leave_one_out(self, name: str) -> Floats:
         """(n,) the probability of a name if that pose were an outlier: beside
         the likeliest set with the name, less the name. As it is, where the pose
-        is one of that set's outliers."""
+        is one of that set's outliers, or one of many that tell little."""
         if name not in self._without:
             self._without[name] = self._leave_one_out_of(name)
         return self._without[name]
@@ -194,9 +197,8 @@ class Posterior:
         mine = np.array([term.name == name for term in evidence.terms])
         rows = np.argsort(-best.by_part)[:PARTS]
         parts = sorted({0, *(best.parts[row] for row in rows)})
-        for i, term in enumerate(evidence.terms):
-            if term.pose < 0 or i in rest:
-                continue
+        for i in self._telling(best, name):
+            term = evidence.terms[i]
             members = tuple(sorted((*rest, i)))
             base = evidence.of_set(members, parts)
             others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
@@ -205,6 +207,23 @@ class Posterior:
             acts, none = log_sum_exp(each[mine]), log_sum_exp([base.total, *each[~mine]])
             out[term.pose] = np.exp(acts - np.logaddexp(acts, none))
         return out
+
+    def _telling(self, best: SetEvidence, name: str) -> list[int]:
+        """The terms of the outliers that are asked about, beside the likeliest
+        set with that name: of many poses those without which its effect would
+        explain least."""
+        evidence = self.evidence
+        row = int(np.argmax(best.by_part))
+        sizes = dict(zip(best.members, best.sizes[int(np.argmax(best.log[row]))], strict=True))
+        outliers = [i for i, term in enumerate(evidence.terms) if term.pose >= 0 and i not in sizes]
+        if len(outliers) <= LEFT_OUT:
+            return outliers
+        (effect,) = (i for i in best.members if evidence.terms[i].name == name)
+        rest = [i for i in best.members if i != effect]
+        explained = evidence.explained_without(
+            best.parts[row], rest, [sizes[i] for i in rest], (effect, sizes[effect]), outliers
+        )
+        return [outliers[k] for k in np.sort(np.argsort(explained, kind="stable")[:LEFT_OUT])]
 
     @cached_property
     def _total(self) -> float:

@@ -20,6 +20,7 @@ from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 from triaxcal.evidence.mixture_components import Components, components
 from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.row_covariance import RowPrecision
 from triaxcal.evidence.terms import Term
 from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledCovariance, UnmodelledKind
 
@@ -88,7 +89,7 @@ class Predictive:
 
 
 def _unmodelled(
-    kind: UnmodelledCovariance | None, tau: float, here: PoseInputs, there: PoseInputs, inverse: Floats
+    kind: UnmodelledCovariance | None, tau: float, here: PoseInputs, there: PoseInputs, inverse: RowPrecision
 ) -> tuple[Floats, Floats]:
     """Of the rows to come, noise and what no term describes: the best linear
     prediction (M,N) by the rows seen, of whose covariance this is the
@@ -130,7 +131,7 @@ def _columns(evidence: Evidence, members: Sequence[int], rows: LinearisedData) -
     """(M,C) of all terms in the rows to come; zero of those that are no
     ``members``, of outliers, and where an effect of another package does not
     say what it adds."""
-    out = np.zeros((len(rows.y), evidence.columns.shape[1]))
+    out = np.zeros((len(rows.y), evidence.columns.count))
     known: dict[int, Floats] = {}
     for i in members:
         term = evidence.terms[i]

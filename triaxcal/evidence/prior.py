@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from triaxcal.effects.odds import EFFECT_ODDS, ON_ONE_AXIS, ON_TWO_AXES, SIZES, SMALLEST
 from triaxcal.rounding import reaches
 
 
@@ -19,7 +20,7 @@ class Odds:
     every recording.
     """
 
-    effect_odds: float = 0.3
+    effect_odds: float = EFFECT_ODDS
     """That some effect of the catalogue acts, shared evenly among the names
     that can; a second one likewise."""
     pooled_effect_probability: float = 0.3
@@ -38,9 +39,9 @@ class Odds:
     largest_outlier: float = 1.0
     """Of the reference, as of another unit or mounting: a pose that was moved,
     or turned over, is off by as much."""
-    smallest: float = 0.1
+    smallest: float = SMALLEST
     """Of the noise of a pose: what is less shows in no data."""
-    sizes: int = 9
+    sizes: int = SIZES
     """Steps between the two, even in the logarithm: a factor of 3 to 5, within
     which the evidence hardly changes."""
     unmodelled_smallest: float = 0.4
@@ -48,8 +49,8 @@ class Odds:
     unmodelled_sizes: int = 7
     """Of an unmodelled part in standard errors of a pose: from what hardly
     shows to what no effect exceeds."""
-    on_one_axis: float = 0.25
-    on_two_axes: float = 0.25
+    on_one_axis: float = ON_ONE_AXIS
+    on_two_axes: float = ON_TWO_AXES
     """Of an effect with a part for each axis: usually, in the half that is
     left, one mechanism acts on all of them."""
     certain: float = 0.99

@@ -20,9 +20,11 @@ from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.model_search import likely_sets
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
+from triaxcal.progress import Progress, Stage, untold
 from triaxcal.rounding import reaches
 
 ROUNDS = 4
@@ -46,6 +48,7 @@ def posterior_of(
     signs: Sequence[float] = (1, 1, 1),
     catalogue: Sequence[Effect] | None = None,
     odds: Odds | None = None,
+    progress: Progress = untold,
 ) -> Posterior:
     """Of what acts beside the ``linear`` fit of these poses."""
     odds = odds or Odds()
@@ -53,19 +56,21 @@ def posterior_of(
     rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
     near: int | None = None
     done = 0
+
+    def told(share: float) -> None:
+        progress(Stage.EFFECTS, (done + share) / ROUNDS)
+
     while True:
-        posterior = _likely(Evidence(rows, terms_of(rows, effects, odds, finer, near), odds))
+        told(0.0)
+        evidence = Evidence(rows, terms_of(rows, effects, odds, finer, near), odds)
+        posterior = Posterior(evidence, likely_sets(evidence, told))
         done += 1
         point, split = _point_of(posterior), finer_shapes(posterior)
         seen, near = near, coarse_change_point(posterior, near)
         if done == ROUNDS or (point is None and not split and near == seen):
             return posterior
-        del posterior  # of a thousand poses it holds a gigabyte, and so will the next
+        del posterior, evidence  # of a thousand poses it holds much memory, and so will the next
         rows, finer = rows if point is None else rows.relinearised_at(point), [*finer, split]
-
-
-def _likely(evidence: Evidence) -> Posterior:
-    return Posterior(evidence, likely_sets(evidence))
 
 
 def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:
@@ -129,15 +134,16 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
 
 def _point_of(posterior: Posterior) -> State | None:
     """The parameters of the likeliest model; None where the linearisation holds
-    for them, or where that model has no effect."""
+    for them, where that model has no effect, or where it fits no better there
+    than nothing does: so far the linearisation does not reach."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):
         return None
     scaled = best.coefficients
-    inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
-    left = inverse @ (rows.y - evidence.columns[:, evidence.places(best.members)] @ scaled)
-    linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)
+    inverse = evidence.precision(best.parts[int(np.argmax(best.by_part))])
+    left = inverse @ (rows.y - evidence.columns.at(evidence.places(best.members)) @ scaled)
+    linear = inverse_of(rows.linear.T @ inverse @ rows.linear) @ (rows.linear.T @ left)
     effects, coefficients, predicted = [], [], rows.linear @ linear - rows.y
     ends = np.cumsum([0, *(term.rank for term in terms)])
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
@@ -149,8 +155,11 @@ def _point_of(posterior: Posterior) -> State | None:
             predicted = predicted + rows.by_coefficients(term.effect) @ own
     point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
     try:
-        found, _, _ = linearise_all(rows.problem, point, jacobian=False)
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far is none
+            found = linearise_all(rows.problem, point, jacobian=False)[0] / rows.error
+            if not found @ (inverse @ found) < rows.y @ (inverse @ rows.y):
+                return None
     except Refused:
         return None
-    curved = rows.complement.T @ (found / rows.error - predicted)
+    curved = rows.beyond_linear(found - predicted)
     return point if curved @ curved > evidence.odds.relinearise_chi2 else None

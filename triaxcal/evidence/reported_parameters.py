@@ -39,7 +39,7 @@ class Projection:
         each = [_derivatives(posterior, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
         linear = np.concatenate([rows.linear, there.linear])
-        by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
+        by_term = np.zeros((9 + ends[-1], evidence.columns.count))
         of_name = {effect.name: k for k, effect in enumerate(likeliest)}
         nothing = np.empty((len(linear), 0))
         known: dict[int, Floats] = {}

@@ -3,7 +3,6 @@ one shape; poses that are outliers."""
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,12 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints, evenly_spread
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
+from triaxcal.effects.odds import AXES, on_axes
 from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.term_columns import ScaledColumns
 from triaxcal.model.directions import spiral
 from triaxcal.poses.covariates import static_covariates
 
@@ -26,14 +27,14 @@ CHANGE_POINTS = 100
 likeliest are looked at afterwards."""
 SPHERE = 48
 """Directions over which the size of an effect is reckoned."""
+SIZE_POSES = 200
+"""Poses, evenly spread over all, over whose covariates it is reckoned."""
 NOTHING_G = 1e-12
 """A coefficient that makes less than this makes nothing but rounding: no term
 is scaled by it."""
 ABSORBED = 1e-6
 """Of a term's columns: what the nine parameters leave no more of is theirs, to
 rounding."""
-AXES = 3
-"""The sensitive axes, and the components of a vector."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Term:
 
     name: str
     kind: str
-    columns: Floats
+    columns: ScaledColumns
     combination: Floats
     log_prior: float
     effect: Effect | None = None
@@ -57,7 +58,7 @@ class Term:
 
     @property
     def rank(self) -> int:
-        return int(self.columns.shape[1])
+        return self.columns.rank
 
 
 Variant = tuple[str, tuple[str, ...], tuple[float, ...]]
@@ -118,7 +119,7 @@ def _of_effect(
     for variant in variants:
         forms[tuple(c.name for c in variant.coefficients)].append(variant)
     for shapes in forms.values():
-        chosen = list(_axes([c.part for c in shapes[0].coefficients], odds))
+        chosen = list(on_axes([c.part for c in shapes[0].coefficients], odds.on_one_axis, odds.on_two_axes))
         for shape, of_shape in _divided(shapes, finer):
             made = _columns(rows, shape)
             if made is None:
@@ -130,10 +131,11 @@ def _of_effect(
                     continue
                 combination = 1 / (size[index] * np.sqrt(len(index)))
                 own = columns[:, index] * combination
-                if np.linalg.norm(rows.complement.T @ own) < ABSORBED * np.linalg.norm(own):
+                if np.linalg.norm(rows.beyond_linear(own)) < ABSORBED * np.linalg.norm(own):
                     continue
                 prior = share + np.log(of_axes * of_shape / len(forms))
-                yield Term(effect.name, effect.name, own, combination, prior, shape, kept)
+                scaled = ScaledColumns(columns, np.array(index), combination, len(columns))
+                yield Term(effect.name, effect.name, scaled, combination, prior, shape, kept)
 
 
 def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Effect, float]]:
@@ -143,26 +145,6 @@ def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Eff
         each = [(division.get(variant_of(shape), (shape,)), share) for shape, share in out]
         out = [(shape, share / len(ones)) for ones, share in each for shape in ones]
     return out
-
-
-def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Which coefficients are free, and with which share of the prior."""
-    labels = list(dict.fromkeys(parts))
-    whole = tuple(range(len(parts)))
-    if len(labels) == 1:
-        yield whole, 1.0
-        return
-    two = odds.on_two_axes if len(labels) == AXES else 0.0
-    yield whole, 1 - odds.on_one_axis - two
-
-    def of(some: Sequence[str]) -> tuple[int, ...]:
-        return tuple(i for i, part in enumerate(parts) if part in some)
-
-    for label in labels:
-        yield of([label]), odds.on_one_axis / len(labels)
-    if two:
-        for pair in itertools.combinations(labels, 2):
-            yield of(pair), two / AXES
 
 
 def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | None:
@@ -175,9 +157,9 @@ def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | No
         covariates = rows.problem.covariates
         if is_foreign(effect):  # it may not know its slope
             effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates), covariates)
-        up = spiral(SPHERE) * rows.problem.reference
-        every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in covariates.items()}
-        basis = effect.basis(np.tile(up, (rows.n, 1)), every).reshape(rows.n, len(up), AXES, -1)
+        up, some = spiral(SPHERE) * rows.problem.reference, evenly_spread(np.arange(rows.n), SIZE_POSES)
+        every: Mapping[str, Floats] = {name: np.repeat(values[some], len(up)) for name, values in covariates.items()}
+        basis = effect.basis(np.tile(up, (len(some), 1)), every).reshape(len(some), len(up), AXES, -1)
     except (EffectFault, Refused):
         return None
     if not (np.isfinite(columns).all() and np.isfinite(basis).all()):
@@ -189,12 +171,10 @@ def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | No
 
 def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:
     """Its mean is off, and its slope with it."""
-    columns = np.zeros((len(rows.y), 2 if rows.slopes else 1))
-    columns[pose, 0] = 1 / rows.error[pose]
-    if rows.slopes:
-        columns[rows.n + pose, 1] = 1 / rows.error[rows.n + pose]
-    combination = np.full(columns.shape[1], 1 / np.sqrt(columns.shape[1]))
-    return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier_odds)), pose=pose)
+    own = np.array([pose, rows.n + pose] if rows.slopes else [pose])
+    combination = np.full(len(own), 1 / np.sqrt(len(own)))
+    columns = ScaledColumns(None, own, combination / rows.error[own], len(rows.y))
+    return Term("", f"outlier {pose}", columns, combination, float(np.log(odds.outlier_odds)), pose=pose)
 
 
 def change_points(n: int) -> Ints:
@@ -225,6 +205,7 @@ def _another(rows: LinearisedData, odds: Odds, near: int | None) -> Iterator[Ter
     for cut, sharing in _change_points(rows.n, near).items():
         late = np.zeros(rows.n, dtype=bool)
         late[order[cut:]] = True
-        columns = rows.linear * np.resize(late, len(rows.y))[:, None] * combination
+        source = rows.linear * np.resize(late, len(rows.y))[:, None]
+        columns = ScaledColumns(source, np.arange(len(combination)), combination, len(source))
         prior = float(np.log(odds.change_point_odds / sharing))
         yield Term("", "another", columns, combination, prior, change_point=int(order[cut]))

@@ -16,14 +16,17 @@ from typing import Protocol
 
 import numpy as np
 
-from triaxcal.arrays import Floats, Ints
+from triaxcal.arrays import Floats, Ints, evenly_spread
 from triaxcal.effects.contract import BEFORE
 from triaxcal.estimate.likelihood import radius_by_linear
-from triaxcal.evidence.linearised_data import LinearisedData
+from triaxcal.evidence.linearised_data import LinearisedData, in_attitude
+from triaxcal.evidence.row_covariance import LowRank, OwnVariances
 from triaxcal.model.directions import spiral
 
 SPHERE = 300
 """Directions over which the nine parameters absorb what they can."""
+SOME = 60
+"""Of these, over which the mean variance of a function is reckoned."""
 SMOOTH = (0.4, 0.8)
 """Correlation lengths on the sphere, of unit radius: bumps of a face's size,
 and of a hemisphere's."""
@@ -40,6 +43,10 @@ share of its covariance. An example is time, where the times of the poses are
 unknown."""
 
 
+BLOCK = 32
+"""Poses at a time whose covariance is decomposed."""
+
+
 class UnmodelledKind(StrEnum):
     """What an unmodelled part goes with."""
 
@@ -53,6 +60,10 @@ class UnmodelledKind(StrEnum):
     """The slopes alone, as by noise of a logged channel."""
 
 
+OWN = (UnmodelledKind.EACH_POSE, UnmodelledKind.WITHIN_POSE)
+"""What each row has by itself."""
+
+
 @dataclass(frozen=True, eq=False)
 class ReadingGeometry:
     """k readings: ``up`` (k,3) unit vectors, ``by_bias`` (k,3) derivatives of
@@ -64,6 +75,10 @@ class ReadingGeometry:
     by_bias: Floats
     along: Floats
     linear: Floats
+
+    def only(self, readings: Ints) -> ReadingGeometry:
+        """Those of some of the readings."""
+        return ReadingGeometry(*(each[readings] for each in (self.up, self.by_bias, self.along, self.linear)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +100,28 @@ class PoseInputs:
     def of(cls, rows: LinearisedData) -> PoseInputs:
         covariates = rows.problem.covariates
         before = np.stack([covariates[name] for name in BEFORE], axis=1) / rows.problem.reference
-        return cls(
-            reading_geometry(rows, rows.problem.u), before, rows.t_s, rows.duration_s, rows.run, rows.error, rows.slopes
-        )
+        u = in_attitude(rows.problem, rows.state).u
+        return cls(reading_geometry(rows, u), before, rows.t_s, rows.duration_s, rows.run, rows.error, rows.slopes)
 
     @property
     def k(self) -> int:
         return len(self.t_s)
+
+    def only(self, poses: Ints) -> PoseInputs:
+        """Those of some of the poses."""
+        return PoseInputs(
+            self.reading_geometry.only(poses),
+            self.before[poses],
+            self.t_s[poses],
+            self.duration_s[poses],
+            self.run[poses],
+            self.error[self.rows_of(poses)],
+            self.slopes,
+        )
+
+    def rows_of(self, poses: Ints) -> Ints:
+        """The places of their rows."""
+        return np.concatenate([poses, poses + self.k]) if self.slopes else poses
 
 
 class _Between(Protocol):
@@ -103,19 +133,19 @@ class _Between(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class UnmodelledCovariance:
-    """A covariance of the rows beside the nine parameters, in its own axes:
-    ``variance`` (m,) along ``axes`` (m,m), with mean 1, so that τ² is the mean
-    variance in units of the noise. ``covariance`` (N,N) of the rows over their
-    errors, and ``between`` what makes it and that of any other poses; every
-    covariance of this kind is to be multiplied by ``scale``. ``length`` is that
-    of its correlation."""
+    """A covariance of the rows beside the nine parameters, of which these leave
+    a mean variance of 1 in units of the noise. ``of_rows`` is that of the rows
+    over their errors, and ``between`` what makes it and that of any other
+    poses; every covariance of this kind is to be multiplied by ``scale``.
+    ``length`` is that of its correlation. ``whole`` is the rms of |a| that it
+    makes over the sphere, in the unit of the reference: of poses all over it
+    about their mean noise, of others what they do not show as well."""
 
     what: UnmodelledKind
     length: float
-    variance: Floats
-    axes: Floats
-    covariance: Floats
     scale: float
+    whole: float
+    of_rows: OwnVariances | LowRank
     between: _Between
 
     def covariance_of(self, p: PoseInputs, q: PoseInputs) -> Floats:
@@ -142,24 +172,64 @@ def duration_of(rows: LinearisedData) -> float:
 
 def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
     found = []
-    here = PoseInputs.of(rows)
-    for what, length, between in _covariances(rows):
-        weighted = between(here, here) / rows.error[:, None] / rows.error
-        inner = rows.complement.T @ weighted @ rows.complement
-        total = float(np.trace(inner))
-        if total <= ABSORBED * np.trace(weighted):
+    here, sphere = PoseInputs.of(rows), _Sphere.of(rows)
+    everywhere = _everywhere(sphere.everywhere, rows.slopes)
+    for what, length, between in _covariances(rows, sphere):
+        variances = _variances(between, here)
+        of_rows = OwnVariances(variances) if what in OWN else LowRank(_factor(between, here, variances))
+        shown = float(of_rows.beyond(rows.basis).sum())
+        if shown <= ABSORBED * variances.sum():
             continue
-        scale = len(inner) / total
-        variance, axes = np.linalg.eigh(inner * scale)
-        found.append(
-            UnmodelledCovariance(what, length, np.maximum(variance, 0.0), axes, weighted * scale, scale, between)
-        )
+        scale = rows.residual_dof / shown
+        whole = float(np.sqrt(scale * np.mean(np.diag(between(everywhere, everywhere))[: everywhere.k])))
+        found.append(UnmodelledCovariance(what, length, scale, whole, of_rows.times(scale), between))
     return found
 
 
-def _covariances(rows: LinearisedData) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
+def _everywhere(geometry: ReadingGeometry, slopes: bool) -> PoseInputs:
+    """Poses all over the sphere, in all else alike."""
+    geometry = geometry.only(evenly_spread(np.arange(len(geometry.up)), SOME))
+    k = len(geometry.up)
+    nothing, error = np.zeros(k), np.ones(2 * k if slopes else k)
+    return PoseInputs(geometry, geometry.up, nothing, nothing, np.zeros(k, dtype=np.int64), error, slopes)
+
+
+def _variances(between: _Between, here: PoseInputs) -> Floats:
+    """(N,) of the rows over their errors."""
+    out = np.empty(len(here.error))
+    for first in range(0, here.k, BLOCK):
+        some = np.arange(first, min(first + BLOCK, here.k))
+        own = here.only(some)
+        out[here.rows_of(some)] = np.diag(between(own, own)) / own.error**2
+    return out
+
+
+def _factor(between: _Between, here: PoseInputs, variances: Floats) -> Floats:
+    """(N,r) whose product with its transpose is the covariance of the rows over
+    their errors, to rounding: by the Cholesky decomposition with pivots, a
+    block of poses at a time (Harbrecht, Peters and Schneider 2012, Appl. Numer.
+    Math. 62:428). Smooth functions have few degrees of freedom, however many
+    poses there are."""
+    factor, left = np.empty((len(variances), 0)), variances
+    least = len(variances) * np.finfo(float).eps * float(variances.max(initial=0.0))
+    while True:
+        of_poses = left.reshape(-1, here.k).max(axis=0)
+        block = np.argsort(-of_poses, kind="stable")[:BLOCK]
+        block = block[of_poses[block] > least]
+        if not len(block):
+            return factor
+        own, rows = here.only(block), here.rows_of(block)
+        rest = between(own, here) / own.error[:, None] / here.error - factor[rows] @ factor.T
+        value, axes = np.linalg.eigh((rest[:, rows] + rest[:, rows].T) / 2)
+        kept = value > least
+        if not kept.any():
+            return factor
+        factor = np.concatenate([factor, rest.T @ (axes[:, kept] / np.sqrt(value[kept]))], axis=1)
+        left = variances - np.sum(factor**2, axis=1)
+
+
+def _covariances(rows: LinearisedData, sphere: _Sphere) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
     yield UnmodelledKind.EACH_POSE, 0.0, _own_of_means
-    sphere = _Sphere.of(rows)
     for length in SMOOTH:
         yield UnmodelledKind.DIRECTION, length, sphere.covariance(partial(_smooth, length=length))
     for what, sign in ((UnmodelledKind.ODD, -1), (UnmodelledKind.EVEN, 1)):

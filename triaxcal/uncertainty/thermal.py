@@ -3,16 +3,21 @@ by the thermometer of those it has."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import softmax
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
+from triaxcal.effects.odds import EFFECT_ODDS, SIZES, SMALLEST, on_axes
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import linearise_all
-from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, noise_levels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.uncertainty.budget_statements import (
     PosesAtOtherTemperatures,
     ProbableTemperature,
@@ -31,6 +36,8 @@ SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not
 taken up: in references per kelvin, and per kelvin. Typical of a mass-market
 MEMS accelerometer's data sheet; a navigation unit is ten times better."""
+LARGEST = 3.0
+"""Of that standard deviation: a unit that is worse has another data sheet."""
 NO_SENSITIVITY = 1e-12
 """In place of a sensitivity of zero, whose inverse is infinite: it makes
 nothing that shows."""
@@ -43,10 +50,11 @@ def temperature(
     parameters; and the share of the residuals' variance beyond noise that they
     do not explain, 0…1, lest it count twice.
 
-    A coefficient that did not show is not zero: it is what the data leave of
-    the sensitivity that was ``stated``, or of `SENSITIVITY_PER_K`, a mean and a
-    spread by Bayes' rule. The parameters of a fit without it are off by what it
-    does to them.
+    A coefficient that did not show is not zero. Where the sensitivity of such
+    units was ``stated``, it is what the data leave of that, a mean and a spread
+    by Bayes' rule. Else an effect acts as probably, and as largely, as the
+    posterior of a diagnosis has it before any data, and the data leave so much
+    of that. The parameters of a fit without it are off by what it does to them.
     """
     if calibration.prior_sd is not None:
         return _as_probable(calibration, linearised), 1.0
@@ -55,16 +63,33 @@ def temperature(
         return [], 1.0
     widths = [[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing]
     lacking = _Lacking.of(linearised, missing, np.concatenate(widths))
-    mean, left = lacking.posterior()
-    covariances = np.eye(len(mean)), left, _posterior(lacking.of_means), left + np.outer(mean, mean)
+    known = stated.thermal_sensitivity is not None
+    found = lacking.of_sensitivity if known else lacking.averaged(missing, _levels(calibration))
+    covariances = np.eye(len(found.mean)), lacking.of_sensitivity.within, _posterior(lacking.of_means), found.second
     of_parameters = [lacking.through @ c @ lacking.through.T for c in covariances]
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
     names = tuple(e.name for e in missing)
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
     identifiable = not isinstance(by, PosesAtOtherTemperatures)
-    basis = UnmodelledTemperature(names, moved, identifiable, stated=stated.thermal_sensitivity is not None)
+    basis = UnmodelledTemperature(names, moved, identifiable, stated=known)
     component = Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)
-    return [component], lacking.unexplained(mean, left, linearised.weighted.shape[1])
+    return [component], lacking.unexplained(found, linearised.weighted.shape[1])
+
+
+def _levels(calibration: Calibration) -> NoiseLevels:
+    return noise_levels([p.pose for p in calibration.poses if p.used])
+
+
+@dataclass(frozen=True, eq=False)
+class _Coefficients:
+    """``mean`` (q,), the covariance ``within`` (q,q) that the data leave, and
+    the ``second`` moments (q,q) about zero; ``taken`` is how many of them the
+    data tell."""
+
+    mean: Floats
+    within: Floats
+    second: Floats
+    taken: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +98,15 @@ class _Lacking:
     prior widths. ``misses`` (N,) are the residuals of the fit in standard
     errors of their noise, ``columns`` (N,q) their derivatives, of which the
     fitted parameters leave the ``rest``; ``through`` (p,q) is what a
-    coefficient does to these parameters. The first ``n`` rows are means."""
+    coefficient does to these parameters, of which there are ``fitted``. The
+    first ``n`` rows are means."""
 
     misses: Floats
     columns: Floats
     rest: Floats
     through: Floats
     n: int
+    fitted: int
 
     @classmethod
     def of(cls, linearised: ErrorPropagation, effects: Sequence[Effect], widths: Floats) -> _Lacking:
@@ -89,30 +116,76 @@ class _Lacking:
         columns = J[:, p:] * widths / s[:, None]
         absorbed = linearised.gain @ (J[:, p:] * widths / linearised.error[:, None])
         rest = columns - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
-        return cls(r / s, columns, rest, linearised.G @ absorbed[:p], len(linearised.problem.u))
+        return cls(r / s, columns, rest, linearised.G @ absorbed[:p], len(linearised.problem.u), p)
 
     @property
     def of_means(self) -> Floats:
         return self.columns[: self.n]
 
-    def posterior(self) -> tuple[Floats, Floats]:
-        """Mean (q,) and covariance (q,q). With the prior's width as unit: what
-        the poses do not show stays as wide as it was. By the means alone:
-        slopes know nothing of an effect whose coefficients, and so its
-        covariates' errors, are zero."""
+    @cached_property
+    def of_sensitivity(self) -> _Coefficients:
+        """With the prior's width as unit: what the poses do not show stays as
+        wide as it was. By the means alone: slopes know nothing of an effect
+        whose coefficients, and so its covariates' errors, are zero."""
         rest = self.rest[: self.n]
         left = _posterior(rest)
-        return -left @ rest.T @ self.misses[: self.n], left
+        mean = -left @ rest.T @ self.misses[: self.n]
+        # Fewer than coefficients where the data say little.
+        taken = len(mean) - float(np.trace(left))
+        return _Coefficients(mean, left, left + np.outer(mean, mean), taken)
 
-    def unexplained(self, mean: Floats, left: Floats, fitted: int) -> float:
+    def averaged(self, effects: Sequence[Effect], levels: NoiseLevels) -> _Coefficients:
+        """Over which of the effects act, on which axes, and how large they are;
+        ``levels`` are those of the noise."""
+        log_prior, widths = map(np.array, zip(*_hypotheses(effects, self.of_means), strict=True))
+        rest, misses = self.rest[: self.n], self.misses[: self.n]
+        information, score = rest.T @ rest, -rest.T @ misses
+        size, axes = np.linalg.eigh(widths[:, :, None] * information * widths[:, None])
+        size = np.maximum(size, 0.0)
+        axes = widths[:, :, None] * axes
+        along = np.einsum("hqr,q->hr", axes, score) / (1 + size)
+        chi2 = float(misses @ misses) - np.sum(along**2 * (1 + size), axis=1)
+        left = max(self.n - self.fitted, 1)
+        log = log_prior + levels.log_likelihood(chi2, left) - 0.5 * np.log1p(size).sum(axis=1)
+        share = softmax(log)
+        mean = np.einsum("hqr,hr->hq", axes, along)
+        within = np.einsum("h,hqr,hr,hpr->qp", share, axes, 1 / (1 + size), axes)
+        second = within + np.einsum("h,hq,hp->qp", share, mean, mean)
+        return _Coefficients(share @ mean, within, second, float(share @ np.sum(size / (1 + size), axis=1)))
+
+    def unexplained(self, found: _Coefficients, fitted: int) -> float:
         """The share of the residuals' variance beyond noise that is no such
         effect, 0…1; ``fitted`` parameters took their degrees of freedom."""
-        taken = len(mean) - float(np.trace(left))  # fewer than coefficients where the data say little
         before, after = (
             float(v @ v) / max(len(v) - fitted - dof, 1e-9)
-            for v, dof in ((self.misses, 0.0), (self.misses + self.rest @ mean, taken))
+            for v, dof in ((self.misses, 0.0), (self.misses + self.rest @ found.mean, found.taken))
         )
         return min(max(after - 1, 0.0) / (before - 1), 1.0) if before > 1 else 1.0
+
+
+def _hypotheses(effects: Sequence[Effect], columns: Floats) -> Iterator[tuple[float, Floats]]:
+    """Nothing, each effect on some axes and of some size, and all of them on all
+    axes: the logarithm of its prior, and the widths (q,) of the coefficients in
+    units of the typical sensitivity. ``columns`` (n,q) are what they then do to
+    the means, over the noise."""
+    odds = EFFECT_ODDS / len(CATALOGUE)
+    ends = np.cumsum([0, *(len(e.coefficients) for e in effects)])
+    yield 0.0, np.zeros(ends[-1])
+    whole: list[list[Floats]] = []
+    for effect, first, last in zip(effects, ends, ends[1:], strict=False):
+        shown = float(np.sqrt(np.mean(np.sum(columns[:, first:last] ** 2, axis=1))))
+        sizes = np.geomspace(min(SMALLEST / max(shown, 1e-300), LARGEST), LARGEST, SIZES)
+        whole.append([])
+        for kept, share in on_axes([c.part for c in effect.coefficients]):
+            for size in sizes:
+                widths = np.zeros(ends[-1])
+                widths[first + np.array(kept)] = size
+                yield float(np.log(odds * share / SIZES)), widths
+                if len(kept) == last - first:
+                    whole[-1].append(widths)
+    if len(effects) > 1:
+        for each in itertools.product(*whole):
+            yield len(effects) * float(np.log(odds / SIZES)), np.sum(each, axis=0)
 
 
 def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list[Component]:

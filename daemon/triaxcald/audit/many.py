@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,9 +27,9 @@ class Audited:
     exit_code: int = DONE
 
 
-def audit_each(asked: Sequence[Path]) -> Iterator[Audited]:
+def audit_each(asked: Sequence[Path], begins: Callable[[Path], None] = lambda path: None) -> Iterator[Audited]:
     """Recordings, folders of recordings, and patterns, in the order in which
-    they are given, each recording once."""
+    they are given, each recording once; ``begins`` is called before each."""
     seen: set[Path] = set()
     for given in asked:
         try:
@@ -40,6 +40,7 @@ def audit_each(asked: Sequence[Path]) -> Iterator[Audited]:
         for path in paths:
             if path not in seen:
                 seen.add(path)
+                begins(path)
                 yield _audited(path)
 
 

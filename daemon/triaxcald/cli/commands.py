@@ -85,7 +85,10 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
         if not gc.isenabled():  # as the program begins
             gc.freeze()
             gc.enable()
-        code: int = command(chosen)
+        from triaxcald.cli.progress import telling_progress
+
+        with telling_progress():
+            code: int = command(chosen)
         return code
 
     return work

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from triaxcal.units import ErrorUnit
 from triaxcald.abort import add_action, discard_action, steer
+from triaxcald.cli.progress import erased
 from triaxcald.printable import printable, printable_json
 from triaxcald.text import waits
 
@@ -27,12 +28,14 @@ if TYPE_CHECKING:  # every command says something, few show poses
 
 def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
     """One JSON document on standard output, nothing else."""
+    erased()
     sys.stdout.write(printable_json(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)) + "\n")
 
 
 def show(line: str) -> None:
     """A line of what came of the work, to standard output; what a file holds
     may be quoted in it, as in `say`."""
+    erased()
     sys.stdout.write(printable(line) + "\n")
 
 
@@ -64,6 +67,7 @@ def say(text: str) -> None:
     What a file holds may be quoted in it: that can neither begin a second line
     nor steer the terminal.
     """
+    erased()
     line = printable(text)
     if len(line) > LINE_MOST:
         line = f"{line[: LINE_MOST // 2]} … {line[-LINE_MOST // 2 :]}"
@@ -75,6 +79,7 @@ def say(text: str) -> None:
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """To standard output; columns of numbers are the caller's text, and a tuple
     has a line for each of its texts."""
+    erased()
     shown = Table(title=printable(title), title_justify="left", header_style="bold")
     for i, name in enumerate(columns):
         shown.add_column(printable(name), justify="left" if i == 0 else "right", overflow="fold")

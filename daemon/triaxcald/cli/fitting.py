@@ -15,10 +15,12 @@ from triaxcal.interchange.calibration_document import Document, calibration_docu
 from triaxcal.model.moment import Moment
 from triaxcal.pooled_units import pooled_analysis
 from triaxcal.poses.pose import Pose
+from triaxcal.progress import Stage
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, show
 from triaxcald.cli.methods import Way, chosen_way, default_signs, telling_default_signs
+from triaxcald.cli.progress import progress
 from triaxcald.cli.results import show_calibration, show_loop, show_summary, text_of_held_out
 from triaxcald.cli.several import (
     as_one_unit,
@@ -47,6 +49,7 @@ def fit_command(a: argparse.Namespace) -> int:
     measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
+        progress(Stage.FIT)
         calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
     document = calibration_document(
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
@@ -91,6 +94,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
         doubts += doubts_of_check(measured, check, loop, choice)
+    progress(Stage.ADVICE)
     document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:
         document = with_recordings(document, loop, names)
@@ -118,6 +122,7 @@ def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequ
             reference=choice.reference,
             check=check,
             at=a.at if a.at is not None else measured.holds_at or Moment.END,
+            progress=progress,
         )
 
 

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say, show
+from triaxcald.cli.progress import at
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
@@ -30,7 +31,7 @@ def audit_command(a: argparse.Namespace) -> int:
     from triaxcald.audit import audit_each, text, worst  # the whole line, which no `log` needs
 
     audited = []
-    for one in audit_each(a.recordings):
+    for one in audit_each(a.recordings, lambda path: at(f"auditing {path}")):
         audited.append(one)
         if one.audit is None:
             say(f"triaxcal: {one.error}")

@@ -18,6 +18,7 @@ from triaxcal.rounding import error
 from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
+from triaxcald.cli.progress import at
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, require_same_outputs
 from triaxcald.recording.series import is_recording
@@ -53,6 +54,7 @@ def read_recording(
     them; ``turn_s`` as for `measure`. Raises InputError where that is of other
     units. ``wanted_by`` is a calibration that needs its channels, of whatever
     units."""
+    at(f"reading {name}")
     found = measure(name, moments=moments, reading=reading_of(a, name, of or wanted_by), turn_s=turn_s)
     if of is not None:
         require_same_outputs(of, name, a.output_unit or found.output_unit)

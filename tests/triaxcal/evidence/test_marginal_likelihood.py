@@ -14,6 +14,7 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import terms_of
+from triaxcal.evidence.unmodelled_kernels import PoseInputs
 from triaxcal.poses.pose import Pose
 
 
@@ -28,13 +29,20 @@ def evidence(poses_with: Callable[..., list[Pose]]) -> Evidence:
 def density(evidence: Evidence, part: int, members: tuple[int, ...], sizes: np.ndarray) -> float:
     """Of the misfits beside the nine parameters, under the covariance that all of the hypothesis makes."""
     rows, assumed = evidence.rows, evidence.parts[part]
-    covariance = np.eye(len(rows.z))
+    covariance = np.eye(len(rows.y))
     if assumed.kind is not None:
-        covariance += assumed.tau**2 * (assumed.kind.axes * assumed.kind.variance) @ assumed.kind.axes.T
+        here = PoseInputs.of(rows)
+        covariance += assumed.tau**2 * assumed.kind.covariance_of(here, here)
     for i, size in zip(members, sizes, strict=True):
-        columns = size * rows.complement.T @ evidence.terms[i].columns
+        columns = size * np.asarray(evidence.terms[i].columns)
         covariance += columns @ columns.T
-    return float(stats.multivariate_normal(cov=covariance).logpdf(rows.z))
+    complement = complement_of(rows.linear)
+    return float(stats.multivariate_normal(cov=complement.T @ covariance @ complement).logpdf(complement.T @ rows.y))
+
+
+def complement_of(columns: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what columns leave."""
+    return np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
 
 
 def of(evidence: Evidence, name: str, rank: int) -> int:
@@ -81,9 +89,11 @@ def test_each_term_beside_others_has_the_evidence_of_the_set_of_both(evidence: E
 def test_coefficients_are_those_of_ridge_regression_over_all_sizes(evidence: Evidence) -> None:
     cubic = of(evidence, "third_order_nonlinearity", 3)
     found = evidence.of_set((cubic,), [0])
-    columns = evidence.rows.complement.T @ evidence.terms[cubic].columns
+    complement = complement_of(evidence.rows.linear)
+    columns = complement.T @ np.asarray(evidence.terms[cubic].columns)
     expected = np.zeros(3)
     for size, log in zip(found.sizes[:, 0], found.log[0], strict=True):
-        ridge = np.concatenate([columns, np.eye(3) / size]), np.concatenate([evidence.rows.z, np.zeros(3)])
+        misfits = np.concatenate([complement.T @ evidence.rows.y, np.zeros(3)])
+        ridge = np.concatenate([columns, np.eye(3) / size]), misfits
         expected += np.exp(log - found.total) * np.linalg.lstsq(*ridge)[0]
     assert found.mean[0] == pytest.approx(expected, rel=1e-6, abs=1e-12)

@@ -52,10 +52,10 @@ def test_a_covariance_with_poses_to_come_is_that_of_the_rows_where_they_are_the_
     evidence = Evidence(rows, terms_of(rows, [], Odds()), Odds())
     here, there = PoseInputs.of(rows), PoseInputs.of(rows.of_future_poses(rows.poses))
     for kind in {part.kind for part in evidence.parts if part.kind is not None}:
-        crossed = kind.covariance_of(there, here)
+        crossed, whole = kind.covariance_of(there, here), kind.covariance_of(here, here)
         own = kind.what in (UnmodelledKind.EACH_POSE, UnmodelledKind.WITHIN_POSE)
-        expected = np.zeros_like(kind.covariance) if own else kind.covariance
-        assert crossed == pytest.approx(expected, abs=1e-6 * np.abs(kind.covariance).max()), kind.what
+        expected = np.zeros_like(whole) if own else whole
+        assert crossed == pytest.approx(expected, abs=1e-6 * np.abs(whole).max()), kind.what
         assert pytest.approx(crossed, abs=1e-9) == kind.covariance_of(here, there).T
 
 
@@ -90,7 +90,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
         here, there = PoseInputs.of(rows), PoseInputs.of(ahead)
         crossed = assumed.kind.covariance_of(here, there)
         joint += assumed.tau**2 * np.block(
-            [[assumed.kind.covariance, crossed], [crossed.T, assumed.kind.covariance_of(there, there)]]
+            [[assumed.kind.covariance_of(here, here), crossed], [crossed.T, assumed.kind.covariance_of(there, there)]]
         )
     n = rows.n
     gain = joint[n:, :n] @ np.linalg.inv(joint[:n, :n])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import directions, spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
@@ -26,6 +28,7 @@ from triaxcal.uncertainty.thermal import _posterior
 NOISE = 2e-5
 SIGNS = (-1, -1, -1)
 
+TYPICAL = Stated(thermal_sensitivity=5e-4)
 THERMAL = ("temperature_bias", "temperature_scale_factor")
 
 
@@ -49,7 +52,7 @@ def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: 
     def share(swing_k: float) -> float:
         moved = {"temp_c": 25 + swing_k * np.sin(np.arange(26) * 1.7)}
         poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=moved)
-        found = budget(fit(poses, signs=SIGNS, excluded=())).components
+        found = budget(fit(poses, signs=SIGNS, excluded=()), TYPICAL).components
         return next(x.magnitude for x in found if x.source == "temperature")
 
     steady, moving, wild = share(0.001), share(0.05), share(20.0)
@@ -59,9 +62,7 @@ def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: 
     assert wild < 1.5 * NOISE
 
 
-def test_what_was_stated_of_the_sensitivity_takes_the_place_of_what_is_typical(
-    paper_unit: Sensor, fourteen: np.ndarray
-) -> None:
+def test_a_stated_sensitivity_is_what_the_line_is_made_of(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     """Where the poses tell nothing, the line is as large as the sensitivity."""
     poses = _warming(paper_unit, fourteen, np.linspace(24.9, 25.1, 14), noise=1e-3)
     c = fit(poses, signs=SIGNS, excluded=())
@@ -70,15 +71,16 @@ def test_what_was_stated_of_the_sensitivity_takes_the_place_of_what_is_typical(
         found = budget(c, Stated(thermal_sensitivity=sensitivity)).components
         return next((x for x in found if x.source == "temperature"), None)
 
-    typical, better, tenth = line(None), line(5e-5), line(5e-6)
+    typical, better, tenth, unstated = line(5e-4), line(5e-5), line(5e-6), line(None)
     assert typical is not None
     assert better is not None
     assert tenth is not None
+    assert unstated is not None
     assert better.magnitude == pytest.approx(10 * tenth.magnitude, rel=0.01)
     assert 5 * better.magnitude < typical.magnitude < 11 * better.magnitude
-    assert isinstance(typical.basis, UnmodelledTemperature)
+    assert isinstance(unstated.basis, UnmodelledTemperature)
     assert isinstance(better.basis, UnmodelledTemperature)
-    assert (typical.basis.stated, better.basis.stated) == (False, True)
+    assert (unstated.basis.stated, better.basis.stated) == (False, True)
     nothing = line(0.0)
     assert nothing is None or nothing.magnitude < 1e-9
 
@@ -95,7 +97,7 @@ def test_a_steady_temperature_costs_nothing_whatever_it_is(
 
 def _line(poses: Sequence[Pose], *effects: str) -> Component:
     c = fit(poses, signs=SIGNS, effects=[effect_named(n) for n in effects], excluded=())
-    return next(x for x in budget(c).components if x.source == "temperature")
+    return next(x for x in budget(c, TYPICAL).components if x.source == "temperature")
 
 
 def _warming(unit: Sensor, up: np.ndarray, temperatures_c: np.ndarray, noise: float = NOISE) -> list[Pose]:
@@ -108,7 +110,7 @@ def test_poses_that_cannot_tell_what_a_wide_swing_did_are_to_be_more_not_steadie
 ) -> None:
     rising = np.linspace(18, 32, 14)
     line = _line(_warming(paper_unit, fourteen, rising))
-    assert line.basis == UnmodelledTemperature(THERMAL, pytest.approx(14), identifiable=False)
+    assert line.basis == UnmodelledTemperature(THERMAL, pytest.approx(14), identifiable=False, stated=True)
     assert line.halved_by == PosesAtOtherTemperatures(THERMAL)
     wider = _line(_warming(paper_unit, fourteen, 25 + 2 * (rising - 25)))
     assert wider.magnitude > line.magnitude / 2
@@ -122,7 +124,7 @@ def test_a_temperature_that_hardly_moved_is_to_be_steadier(paper_unit: Sensor, f
     rising = np.linspace(-0.005, 0.005, 14)
     line, steadier = (_line(_warming(paper_unit, fourteen, 25 + share * rising)) for share in (1, 0.5))
     assert line.halved_by == SteadierTemperature(THERMAL)
-    assert line.basis == UnmodelledTemperature(THERMAL, pytest.approx(0.01), identifiable=True)
+    assert line.basis == UnmodelledTemperature(THERMAL, pytest.approx(0.01), identifiable=True, stated=True)
     assert steadier.magnitude == pytest.approx(line.magnitude / 2, rel=0.1)
 
 
@@ -148,6 +150,53 @@ def test_what_noise_leaves_of_thermal_effects_is_to_be_halved_as_noise_is(
     assert line.halved_by.poses == 104
     assert quieter.magnitude == pytest.approx(line.magnitude / 2, rel=0.1)
     assert steadier.magnitude == pytest.approx(line.magnitude, rel=0.1)
+
+
+COURSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "rising": lambda x: x,
+    "warming": lambda x: 1 - np.exp(-4 * x),
+    "swinging": lambda x: np.sin(8 * x) / 2,
+}
+"""Of a temperature, over the share of the recording that is over."""
+
+
+def _stated_and_true(unit: Sensor, true: Sensor, up: np.ndarray, temperatures_c: np.ndarray, seed: int) -> np.ndarray:
+    """(2,) the squares of the stated error of |a|, and of the true one over the sphere."""
+    rng = np.random.default_rng(seed)
+    channels, reference = {"temp_c": temperatures_c}, {"temp_c": float(np.mean(temperatures_c))}
+    poses = noisy_poses(true, rng.permutation(up), NOISE, rng, channels=channels, channel_reference=reference)
+    c = fit(poses, signs=SIGNS)
+    everywhere = spiral(200)
+    off = np.linalg.norm(c.sensor.specific_force(unit.output(everywhere, {}), {}), axis=1) - 1
+    return np.array([float(budget(c).magnitude.standard) ** 2, np.mean(off**2)])
+
+
+@pytest.mark.parametrize("moved_k", [1.0, 20.0])
+@pytest.mark.parametrize("course", COURSES)
+@pytest.mark.parametrize("poses", [14, 26])
+def test_a_moving_temperature_that_does_nothing_costs_little(
+    paper_unit: Sensor, poses: int, course: str, moved_k: float
+) -> None:
+    up = np.array([v for _, v in directions(poses)])
+    temperatures_c = 25 + moved_k * COURSES[course](np.linspace(0, 1, poses))
+    stated, true = np.mean([_stated_and_true(paper_unit, paper_unit, up, temperatures_c, s) for s in range(12)], axis=0)
+    assert 0.9 < np.sqrt(stated / true) < 3.0
+
+
+@pytest.mark.parametrize("size", [3.0, 30.0])
+@pytest.mark.parametrize("name", THERMAL)
+def test_what_a_temperature_does_is_in_the_stated_error(
+    paper_unit: Sensor, twenty_six: np.ndarray, name: str, size: float
+) -> None:
+    """In units of the noise of a pose, on axes drawn at random."""
+    temperatures_c = 25 + 10 * COURSES["rising"](np.linspace(0, 1, 26))
+    found = []
+    for seed in range(12):
+        q = np.random.default_rng(seed).standard_normal(3) * size * NOISE / np.std(temperatures_c)
+        true = replace(paper_unit, effects=((effect_named(name), q),))
+        found.append(_stated_and_true(paper_unit, true, twenty_six, temperatures_c, seed))
+    stated, truth = np.mean(found, axis=0)
+    assert 0.9 < np.sqrt(stated / truth) < 2.0
 
 
 def test_what_the_data_leave_is_a_covariance_also_beside_effects_of_any_size() -> None:
