@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
@@ -107,6 +108,12 @@ class Loop:
     def probabilities(self) -> Mapping[str, float]:
         """That each effect acts, whatever else does, the likeliest first."""
         return self.posterior.effect_probabilities
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a smooth function of the direction is corrected in the place
+        of names."""
+        return Empirical().name in self.after.terms
 
     @cached_property
     def advice(self) -> Advice:

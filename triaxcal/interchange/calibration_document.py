@@ -8,7 +8,7 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual, Unmodelled
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -124,6 +124,7 @@ def calibration_document(
         "standard_error": {name: group(name) for name in LINEAR},
         "parameters": list(c.parameters),
         "correlation": correlation(c.covariance),
+        **({} if c.unmodelled is None else {"unmodelled": _unmodelled(c.unmodelled)}),
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
         "residual": residual_document(c.residual, c.reference),
@@ -163,6 +164,11 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
         **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
         "channels": {name: number(v) for name, v in p.pose.channels.items()},
     }
+
+
+def _unmodelled(part: Unmodelled) -> Document:
+    """Beside the standard errors and their correlation."""
+    return {"along_g": uncertainty(part.along), "across_g": uncertainty(part.across)}
 
 
 def _holds_at(moment: HoldsAt | None) -> Document | None:

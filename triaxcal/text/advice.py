@@ -27,6 +27,7 @@ GOES_WITH = {
     UnmodelledKind.POSE_BEFORE: "the pose before",
     UnmodelledKind.TIME: "the time",
 }
+BY_DIRECTION = " by its name, but the mean over all that may act, as a smooth function of the direction"
 REFUSED = {
     Refusal.UNMODELLED: "something that no effect describes acts as well",
     Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
@@ -65,7 +66,7 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
         if finding.verdict is Verdict.ADOPTED:
             yield f"{finding.effect}: {finding.remedy}"
     if loop.refusal is not None:
-        yield f"no effect is corrected, because {REFUSED[loop.refusal]}"
+        yield f"no effect is corrected{BY_DIRECTION if loop.smooth else ''}, because {REFUSED[loop.refusal]}"
     if loop.held_out is not None and loop.held_out.worse:
         before, after = small.in_full(loop.held_out.before_rms_g), small.in_full(loop.held_out.after_rms_g)
         yield (

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from triaxcal import text
 from triaxcal.diagnosis import Loop
 from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.interchange.calibration_document import assumed_in, holds_of
@@ -72,6 +73,8 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
     units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
     of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
     for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
+        if name.startswith(f"{Empirical().name}."):  # dozens, which mean nothing one by one
+            continue
         expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
         of = of_effects.get(name, units.get(name.split(".")[0], ""))
         rows.append([name, f"{value:.9g}", f"{error:.2g}", *expanded, of])
@@ -81,6 +84,8 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
             told = "—" if known is None else f"{known:.2g}"
             rows.append([f"{effect.name}.{name}", f"{value:.6g}", told, *(["—"] if whole else []), of])
     expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
+    if Empirical().name in c.terms:
+        show(f"{Empirical().name}: a smooth function of the direction, whose coefficients are in the document")
     table("coefficients", ["", "value", "standard error", *expanded_at, "unit"], rows)
     if held := holds_of(c):
         show(f"scale factor, misalignment and bias hold {'; '.join(held)}")
