@@ -12,7 +12,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of
+from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of, local_kinds_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,13 +25,19 @@ class UnmodelledPart:
     log_prior: float
 
 
-def parts_of(rows: LinearisedData, odds: Odds) -> list[UnmodelledPart]:
-    """The first is that there is none."""
+def parts_of(rows: LinearisedData, odds: Odds, suspects: Sequence[int] | None = None) -> list[UnmodelledPart]:
+    """The first is that there is none. Parts that a few poses alone show are
+    among them where some of these are ``suspects``: may be outliers."""
     kinds = kinds_of(rows)
     sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
     share = float(np.log(odds.unmodelled_probability / len(kinds) / len(sizes)))
     none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled_probability)))
-    return [none, *(UnmodelledPart(kind, float(tau), share) for kind in kinds for tau in sizes)]
+    parts = [none, *(UnmodelledPart(kind, float(tau), share) for kind in kinds for tau in sizes)]
+    if suspects is None:
+        return parts
+    local = local_kinds_of(rows, suspects)
+    share = float(np.log(odds.local_probability / max(len(local), 1) / len(sizes)))
+    return [*parts, *(UnmodelledPart(kind, float(tau), share) for kind in local for tau in sizes)]
 
 
 @dataclass(frozen=True, eq=False)

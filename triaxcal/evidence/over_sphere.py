@@ -27,7 +27,7 @@ from triaxcal.model.sensor import LINEAR
 SPHERE = 150
 """Directions: more than a function of direction has free values up to the
 degree that is corrected (`effects.empirical.DEGREES`)."""
-OF_DIRECTION = (UnmodelledKind.DIRECTION, UnmodelledKind.ODD, UnmodelledKind.EVEN)
+OF_DIRECTION = (UnmodelledKind.DIRECTION, UnmodelledKind.ODD, UnmodelledKind.EVEN, UnmodelledKind.LOCAL)
 DRAWN_ANEW = (UnmodelledKind.EACH_POSE, UnmodelledKind.POSE_BEFORE)
 ROUGHER = 4.0
 """Times the variance that a covariance leaves of a function of direction: steps

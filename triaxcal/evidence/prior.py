@@ -30,6 +30,10 @@ class Odds:
     unmodelled_probability: float = 0.2
     """That something acts that no name describes, shared evenly among its
     kinds."""
+    local_probability: float = 0.001
+    """That something acts near one end of an axis, or in one direction, shared
+    among these: less than one outlier, so that a single pose stays one, and more
+    than two, so that those that share a direction do not."""
     change_point_odds: float = 0.005
     """That one calibration does not hold in all poses: a unit exchanged, or its
     channels, in one of two hundred."""

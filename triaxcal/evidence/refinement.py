@@ -52,13 +52,15 @@ def posterior_of(
     effects = considered(poses, catalogue)
     rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
     near: int | None = None
+    suspects: list[int] | None = None
     done = 0
     while True:
-        posterior = _likely(Evidence(rows, terms_of(rows, effects, odds, finer, near), odds))
+        posterior = _likely(Evidence(rows, terms_of(rows, effects, odds, finer, near), odds, suspects))
         done += 1
         point, split = _point_of(posterior), finer_shapes(posterior)
         seen, near = near, coarse_change_point(posterior, near)
-        if done == ROUNDS or (point is None and not split and near == seen):
+        asked, suspects = suspects, _suspects(posterior) if suspects is None else suspects
+        if done == ROUNDS or (point is None and not split and near == seen and asked == suspects):
             return posterior
         del posterior  # of a thousand poses it holds a gigabyte, and so will the next
         rows, finer = rows if point is None else rows.relinearised_at(point), [*finer, split]
@@ -66,6 +68,15 @@ def posterior_of(
 
 def _likely(evidence: Evidence) -> Posterior:
     return Posterior(evidence, likely_sets(evidence))
+
+
+def _suspects(posterior: Posterior) -> list[int] | None:
+    """Poses that are outliers, or none of them where another unit is likely:
+    then something that acts there alone is an alternative, which is asked about
+    no sooner. None where neither is likely."""
+    outliers, least = posterior.outlier_probabilities, posterior.evidence.odds.reported
+    found = [i for i, p in enumerate(outliers) if reaches(p, least)]
+    return found if found or reaches(posterior.change_point_probabilities.sum(), least) else None
 
 
 def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:

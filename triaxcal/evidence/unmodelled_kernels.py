@@ -8,7 +8,7 @@ would come out two or three times worse.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -34,6 +34,10 @@ MEMORY = 0.8
 """Of the reference vector, by the pose before."""
 IN_TIME = (0.1, 0.3)
 """Of the recording's duration."""
+KNEES = (0.7, 0.8, 0.9)
+"""Of the reference vector: where what acts near one end of an axis begins."""
+NEAR = 0.3
+"""On the sphere, of unit radius: how far what acts in one direction reaches."""
 ABSORBED = 1e-9
 """A kind is dropped if projection off the nine parameters leaves less than this
 share of its covariance. An example is time, where the times of the poses are
@@ -49,6 +53,9 @@ class UnmodelledKind(StrEnum):
     EVEN = "even_by_axis"
     POSE_BEFORE = "pose_before"
     TIME = "time"
+    LOCAL = "local"
+    """Near one end of an axis, or in one direction: a few poses that share it
+    alone show it."""
     WITHIN_POSE = "inside_poses"
     """The slopes alone, as by noise of a logged channel."""
 
@@ -141,9 +148,21 @@ def duration_of(rows: LinearisedData) -> float:
 
 
 def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
+    return _whitened(rows, _covariances(rows))
+
+
+def local_kinds_of(rows: LinearisedData, suspects: Sequence[int]) -> list[UnmodelledCovariance]:
+    """What acts near an end of an axis, or about the direction of one of the
+    ``suspects``: poses that may be outliers."""
+    return _whitened(rows, _local(rows, suspects))
+
+
+def _whitened(
+    rows: LinearisedData, covariances: Iterable[tuple[UnmodelledKind, float, _Between]]
+) -> list[UnmodelledCovariance]:
     found = []
     here = PoseInputs.of(rows)
-    for what, length, between in _covariances(rows):
+    for what, length, between in covariances:
         weighted = between(here, here) / rows.error[:, None] / rows.error
         inner = rows.complement.T @ weighted @ rows.complement
         total = float(np.trace(inner))
@@ -170,6 +189,17 @@ def _covariances(rows: LinearisedData) -> Iterator[tuple[UnmodelledKind, float, 
         yield UnmodelledKind.TIME, share, partial(_in_time, length=share * duration_of(rows))
     if rows.slopes:
         yield UnmodelledKind.WITHIN_POSE, 0.0, _own_of_slopes
+
+
+def _local(rows: LinearisedData, suspects: Sequence[int]) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
+    sphere, reference = _Sphere.of(rows), rows.problem.reference
+    for axis in range(3):
+        for end in (1.0, -1.0):
+            of = partial(_beyond_knees, axis=axis, end=end, reference=reference)
+            yield UnmodelledKind.LOCAL, reference, sphere.covariance(of)
+    up = reading_geometry(rows, rows.problem.u).up
+    for pose in suspects:
+        yield UnmodelledKind.LOCAL, NEAR, sphere.covariance(partial(_about, centre=up[pose]))
 
 
 def _same(p: PoseInputs, q: PoseInputs) -> Floats:
@@ -277,3 +307,15 @@ def _by_axis(p: ReadingGeometry, q: ReadingGeometry, sign: int, length: float) -
         mirrored = np.exp(-((p.along[:, None, i] + q.along[None, :, i]) ** 2) / 2 / length**2)
         total += np.outer(p.by_bias[:, i], q.by_bias[:, i]) * (same + sign * mirrored)
     return total
+
+
+def _beyond_knees(p: ReadingGeometry, q: ReadingGeometry, axis: int, end: float, reference: float) -> Floats:
+    """A bend of one axis at one end, beyond a knee that nobody knows."""
+    here, there = (end * g.along[:, axis, None] / reference - KNEES for g in (p, q))
+    bent = np.maximum(here, 0.0) @ (np.maximum(there, 0.0) / (1 - np.array(KNEES)) ** 2).T
+    return np.asarray(np.outer(p.by_bias[:, axis], q.by_bias[:, axis]) * bent)
+
+
+def _about(p: ReadingGeometry, q: ReadingGeometry, centre: Floats) -> Floats:
+    here, there = (np.exp(-np.sum((g.up - centre) ** 2, axis=1) / 2 / NEAR**2) for g in (p, q))
+    return np.asarray(np.outer(here, there) * _smooth(p, q, NEAR))

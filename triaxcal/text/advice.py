@@ -26,6 +26,7 @@ GOES_WITH = {
     UnmodelledKind.EVEN: "the size of an axis's reading",
     UnmodelledKind.POSE_BEFORE: "the pose before",
     UnmodelledKind.TIME: "the time",
+    UnmodelledKind.LOCAL: "one direction, or one end of an axis, which a few poses share",
 }
 BY_DIRECTION = " by its name, but the mean over all that may act, as a smooth function of the direction"
 REFUSED = {

@@ -14,7 +14,9 @@ from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.effects.cross_coupling import CrossCoupling
 from triaxcal.errors import InvalidData
+from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.projected_calibration import reduced
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.directions import directions, spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -130,3 +132,39 @@ def test_what_each_pose_has_of_its_own_is_not_corrected(paper_unit: Sensor) -> N
     assert loop.after.terms == ("linear",)
     assert loop.after.unmodelled is not None
     assert loop.after.unmodelled.along == pytest.approx(3e-4, rel=0.4)
+
+
+def knee(s: np.ndarray) -> np.ndarray:
+    """x gives way beyond −0.9 g."""
+    return np.stack([5e-3 * np.maximum(-s[:, 0] - 0.9, 0.0), 0 * s[:, 0], 0 * s[:, 0]], axis=1)
+
+
+def with_two_poses_beyond_the_knee(unit: Sensor, seed: int) -> list[Pose]:
+    tilted = np.array([-0.94, 0.0, np.sqrt(1 - 0.94**2)])
+    return recorded(unit, knee, seed, [*(up for _, up in directions(26)), tilted])
+
+
+def test_outliers_that_share_a_direction_are_kept_as_evidence(paper_unit: Sensor) -> None:
+    loop = diagnose(with_two_poses_beyond_the_knee(paper_unit, 2), signs=MINUS, catalogue=FEW)
+    assert not loop.found.outliers
+    assert loop.found.change_point is None
+    assert loop.found.unexplained.significant
+    assert loop.found.unexplained.kind is UnmodelledKind.LOCAL
+    assert all(p.used for p in loop.after.poses)
+
+
+def test_one_pose_that_was_knocked_is_an_outlier_all_the_same(
+    paper_unit: Sensor, knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    poses = knocked(recorded(paper_unit, lambda s: 0 * s, 4, [up for _, up in directions(26)]), 5, 5e-4)
+    loop = diagnose(poses, signs=MINUS, catalogue=FEW)
+    assert list(loop.found.outliers) == [5]
+    assert loop.after.poses[5].excluded is Exclusion.OUTLIER
+
+
+def test_two_poses_that_were_knocked_in_other_directions_are_outliers(
+    paper_unit: Sensor, knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    poses = recorded(paper_unit, lambda s: 0 * s, 4, [up for _, up in directions(40)])
+    loop = diagnose(knocked(knocked(poses, 6, 6e-4), 19, -4e-4), signs=MINUS, catalogue=FEW)
+    assert set(loop.found.outliers) == {6, 19}
