@@ -86,16 +86,17 @@ class Diagnosis:
     """The closed loop: ``before`` is the linear calibration, ``calibration``
     the one to use, with the effects that were found; ``findings`` act for
     certain, ``candidates`` more likely than not, and ``probabilities`` has that
-    of every effect that was looked for; ``unexplained`` is what no effect
-    describes, ``held_out`` the error in poses that no fit saw, ``advice`` what
-    to do, a line each. ``call`` is whether the calibration can be used."""
+    of every effect that was looked for, None where it is not calibrated;
+    ``unexplained`` is what no effect describes, ``held_out`` the error in poses
+    that no fit saw, ``advice`` what to do, a line each. ``call`` is whether the
+    calibration can be used."""
 
     before: Calibration
     calibration: Calibration
     call: Recommendation
     findings: tuple[Finding, ...]
     candidates: tuple[Candidate, ...]
-    probabilities: Mapping[str, float]
+    probabilities: Mapping[str, float | None]
     unexplained: Unexplained
     next_recording: NextRecording
     held_out: HoldOut | None
@@ -254,7 +255,7 @@ def diagnose(
         closed_loop.call,
         closed_loop.findings,
         closed_loop.candidates,
-        closed_loop.probabilities,
+        closed_loop.stated,
         closed_loop.found.unexplained,
         following,
         closed_loop.held_out,

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
-from triaxcal.evidence.prior import Odds
 from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
@@ -36,7 +35,7 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     before, after = (c.residual.rms_g for c in (loop.before, loop.after))
     return (
         call(loop.call),
-        cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
+        cause(loop.found, loop.findings, loop.candidates, began, small, loop.stated),
         errors(before, after, following or loop.next_recording, small),
         to_do(loop, small),
     )
@@ -52,7 +51,7 @@ def cause(
     candidates: Sequence[Candidate],
     began: Mapping[int, PoseStart],
     small: ErrorUnit,
-    probabilities: Mapping[str, float],
+    probabilities: Mapping[str, float | None],
 ) -> str:
     """What acts, each with its probability; ``began`` says when the poses
     began, by their place. ``probabilities`` are those of all effects, the
@@ -62,9 +61,9 @@ def cause(
         return "; ".join(said)
     if found.nothing >= EVEN:
         return f"no effect shows (nothing acts with probability {chance(found.nothing)})"
-    likely = [f"{name} ({chance(p)})" for name, p in probabilities.items()][:LIKELIEST]
+    names = [likely(name, p) for name, p in probabilities.items()][:LIKELIEST]
     none = f"something that no effect describes ({chance(found.unexplained.probability)})"
-    return f"something acts, and these poses do not tell what; the likeliest are {', '.join(likely)}; or {none}"
+    return f"something acts, and these poses do not tell what; the likeliest are {', '.join(names)}; or {none}"
 
 
 def _causes(
@@ -83,8 +82,8 @@ def _causes(
     for finding in findings:
         yield f"{_named(finding)} acts"
     for candidate in candidates:
-        one_pose = ", but less so without some one pose" if Odds().hangs_on_one_pose(candidate.probability) else ""
-        yield f"{candidate.effect} probably acts ({chance(candidate.probability)}{one_pose})"
+        one_pose = ", but less so without some one pose" if candidate.hangs_on_one_pose else ""
+        yield f"{candidate.effect} probably acts, if the catalogue has what acts{one_pose}"
     if found.unexplained.significant:
         yield unexplained(found.unexplained, small)
     if found.outliers:
@@ -94,9 +93,14 @@ def _causes(
 
 def _named(finding: Finding) -> str:
     if not finding.alternatives:
-        return f"{finding.effect} ({chance(finding.probability)})"
+        return likely(finding.effect, finding.probability)
     each = {finding.effect: finding.probability, **finding.alternatives}
-    return "one of " + ", ".join(f"{name} ({chance(p)})" for name, p in each.items())
+    return "one of " + ", ".join(likely(name, p) for name, p in each.items())
+
+
+def likely(name: str, p: float | None) -> str:
+    """A name with its probability, where that is calibrated."""
+    return name if p is None else f"{name} ({chance(p)})"
 
 
 def unexplained(part: Unexplained, small: ErrorUnit) -> str:
@@ -110,9 +114,10 @@ def unexplained(part: Unexplained, small: ErrorUnit) -> str:
 
 def reason(finding: Finding, refusal: Refusal | None) -> str:
     """What a finding rests on, and why it is not corrected, where it is not."""
-    said = f"it acts with probability {chance(finding.probability)}"
+    p = finding.probability
+    said = "it probably acts" if p is None else f"it acts with probability {chance(p)}"
     if finding.alternatives:
-        others = ", ".join(f"{name} {chance(p)}" for name, p in finding.alternatives.items())
+        others = ", ".join(likely(name, p) for name, p in finding.alternatives.items())
         together = chance(finding.together)
         said += f", or else {others}: one of them with {together}"
     if finding.verdict is Verdict.CONFOUNDED and refusal is not None:

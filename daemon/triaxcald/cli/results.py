@@ -127,6 +127,10 @@ def text_of_held_out(held: HoldOut, small: ErrorUnit) -> str:
     return f"held out rms {before} before, {after} after, noise floor {floor} ({held.poses} poses)"
 
 
+def chance_of(probability: float | None) -> str:
+    return "likely, not calibrated" if probability is None else diagnosis.chance(probability)
+
+
 def show_loop(loop: Loop, choice: Choice) -> None:
     """Errors, what acts with which probability, and the advice in full."""
     b, f, small = loop.before.residual, loop.after.residual, choice.small
@@ -140,7 +144,8 @@ def show_loop(loop: Loop, choice: Choice) -> None:
         )
     rows.append(["noise floor", small.written(b.noise_floor_g), small.written(f.noise_floor_g)])
     table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
-    likely = [[name, diagnosis.chance(p)] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
+    told = loop.stated
+    likely = [[name, chance_of(told[name])] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", diagnosis.chance(loop.found.nothing)]]
     rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
     table("what acts", ["", "probability"], [*likely, *rest])
