@@ -260,7 +260,7 @@ def diagnose(
         following,
         closed_loop.held_out,
         tuple(diagnosis.advice(closed_loop, small)),
-        diagnosis.lines(closed_loop, small, following),
+        diagnosis.lines(closed_loop, small, following, stated),
     )
 
 

@@ -67,7 +67,7 @@ def loop_document(
     return {
         "format": "triaxcal.loop/1",
         "call": loop.call.value,
-        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)))),
+        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)), stated)),
         "before": residual_document(loop.before.residual, reference),
         "after": residual_document(loop.after.residual, reference),
         **({"held_out": _held_out(loop.held_out, reference)} if loop.held_out else {}),

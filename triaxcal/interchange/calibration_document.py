@@ -24,6 +24,7 @@ from triaxcal.rounding import (
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcal.uncertainty.budget_statements import Basis, UnmodelledTemperature
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
@@ -127,6 +128,7 @@ def calibration_document(
         **({} if c.unmodelled is None else {"unmodelled": _unmodelled(c.unmodelled)}),
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
+        **({} if evaluated is None else {"expanded_uncertainty_g": _scopes(c, evaluated)}),
         "residual": residual_document(c.residual, c.reference),
         "poses": [_pose_result(p, c.reference) for p in c.poses],
         "trends": c.slopes,
@@ -164,6 +166,12 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
         **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
         "channels": {name: number(v) for name, v in p.pose.channels.items()},
     }
+
+
+def _scopes(c: Calibration, evaluated: Budget) -> Document:
+    """Of |a|, by the readings that it is of."""
+    scopes = Scopes.of(c, evaluated, next_recording(c, evaluated))
+    return {name.replace("'", "").replace(" ", "_"): uncertainty(value) for name, value in scopes.named.items()}
 
 
 def _unmodelled(part: Unmodelled) -> Document:

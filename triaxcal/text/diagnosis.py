@@ -5,13 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
+
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
+from triaxcal.number_format import number_of
 from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
+from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import NextRecording, Source
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
@@ -27,16 +32,22 @@ CALLS = {
 }
 
 
-def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) -> tuple[str, str, str, str]:
+def lines(
+    loop: Loop, small: ErrorUnit, following: NextRecording | None = None, stated: Stated | None = None
+) -> tuple[str, str, str, str]:
     """The whole in four lines: the call, the cause, the error before and after,
-    and what to do. ``following`` is the next recording where a station knows
-    more of the reference than the poses tell."""
+    and what to do. ``following`` is the next recording where a station has
+    ``stated`` more of the reference than the poses tell. What a check recording
+    contradicts comes first."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
     before, after = (c.residual.rms_g for c in (loop.before, loop.after))
+    following = following or loop.next_recording
+    scopes = Scopes.of(loop.after, budget(loop.after, stated), following)
+    against = contradiction(loop, scopes, small)
     return (
-        call(loop.call),
+        f"{against}; {call(loop.call)}" if against else call(loop.call),
         cause(loop.found, loop.findings, loop.candidates, began, small, loop.stated),
-        errors(before, after, following or loop.next_recording, small),
+        errors(before, after, scopes, following, small) + excluded(loop, small),
         to_do(loop, small),
     )
 
@@ -125,11 +136,44 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     return said
 
 
-def errors(before_rms: float, after_rms: float, following: NextRecording, small: ErrorUnit) -> str:
-    """The residual before and after, and what to expect of the next recording."""
+def errors(before_rms: float, after_rms: float, scopes: Scopes, following: NextRecording, small: ErrorUnit) -> str:
+    """The residual before and after, in the same poses, and how uncertain |a|
+    is in which readings."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
-    start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
+    start = small.in_full(following.start_to_start)
+    expanded = ", ".join(f"{name} {small.in_full(value)}" for name, value in scopes.named.items())
     return (
-        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; expanded uncertainty in "
-        f"the next recording {within} ({start} from start to start, {how})"
+        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; expanded uncertainty: "
+        f"{expanded} ({start} from start to start, {how})"
     )
+
+
+def excluded(loop: Loop, small: ErrorUnit) -> str:
+    """The poses that neither residual has, and by how much they are off; empty
+    where there is none."""
+    pairs = [
+        (b.residual_g, a.residual_g)
+        for b, a in zip(loop.before.poses, loop.after.poses, strict=True)
+        if not a.used and np.isfinite([b.residual_g, a.residual_g]).all()
+    ]
+    if not pairs:
+        return ""
+    before, after = (small.in_full(float(np.abs(v).max())) for v in np.transpose(pairs))
+    return f"; {number_of(len(pairs), 'pose')} excluded from both, off by up to {before} before, {after} after"
+
+
+def contradiction(loop: Loop, scopes: Scopes, small: ErrorUnit) -> str:
+    """What the check recording contradicts; empty where nothing."""
+    held = loop.held_out
+    if held is None:
+        return ""
+    error, floor = held.after_rms_g, held.noise_floor_g
+    # An rms is compared with an expanded uncertainty, which is two standard ones.
+    if np.sqrt(max(error**2 - floor**2, 0.0)) > scopes.another_day:
+        most = small.in_full(scopes.another_day)
+        said = f"{small.in_full(error)} rms there, expanded uncertainty on another day {most}"
+    elif held.worse:
+        said = f"{small.in_full(held.before_rms_g)} rms there with the linear model, {small.in_full(error)} after"
+    else:
+        return ""
+    return f"the check recording contradicts the calibration: {said}"

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict
+from tests.triaxcal.evidence.conftest import MINUS
+from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict, diagnose
 from triaxcal.evidence.findings import ChangePoint, Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
-from triaxcal.poses.pose import PoseStart
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.text import diagnosis
-from triaxcal.uncertainty.next_recording import NextRecording, Source
+from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.next_recording import NextRecording, Source, next_recording
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
@@ -76,10 +81,10 @@ def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
 
 def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
     assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
-    said = diagnosis.errors(601e-6, 18e-6, assumed, SMALL)
+    said = diagnosis.errors(601e-6, 18e-6, Scopes(12e-6, 40e-6, 4.1e-3), assumed, SMALL)
     assert said == (
-        "residual rms 601.0 µg before, 18.0 µg after; expanded uncertainty in the next recording 4100.0 µg (2000.0 µg "
-        "from start to start, assumed)"
+        "residual rms 601.0 µg before, 18.0 µg after; expanded uncertainty: this fit 12.0 µg, this session's poses "
+        "40.0 µg, another day 4100.0 µg (2000.0 µg from start to start, assumed)"
     )
 
 
@@ -91,3 +96,30 @@ def test_every_refusal_has_words(refused: Refusal) -> None:
 @pytest.mark.parametrize("found", Recommendation)
 def test_every_call_has_words(found: Recommendation) -> None:
     assert diagnosis.call(found)
+
+
+def test_what_a_check_recording_contradicts_comes_first(
+    poses_with: Callable[..., list[Pose]], with_effects: Callable[..., Sensor]
+) -> None:
+    poses, same = poses_with(1), poses_with(2)
+    other = [replace(p, mean=p.mean + with_effects().scale_factor * 2e-2) for p in same]
+    for check, contradicted in ((same, False), (other, True)):
+        loop = diagnose(poses, signs=MINUS, check=check, catalogue=())
+        assert diagnosis.lines(loop, SMALL)[0].startswith("the check recording contradicts") is contradicted
+
+
+def test_poses_that_are_excluded_are_told_beside_the_residuals(
+    poses_with: Callable[..., list[Pose]], knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    loop = diagnose(knocked(poses_with(4), 9, 1e-3), signs=MINUS, catalogue=())
+    assert list(loop.found.outliers) == [9]
+    assert "; 1 pose excluded from both, off by up to 9" in diagnosis.lines(loop, SMALL)[2]
+    assert not diagnosis.excluded(diagnose(poses_with(4), signs=MINUS, catalogue=()), SMALL)
+
+
+def test_each_uncertainty_is_of_more_than_the_one_before(poses_with: Callable[..., list[Pose]]) -> None:
+    c = diagnose(poses_with(4), signs=MINUS, catalogue=()).after
+    found = budget(c)
+    told = list(Scopes.of(c, found, next_recording(c, found)).named.values())
+    assert told[0] == float(found.magnitude.expanded)
+    assert told == sorted(told)
