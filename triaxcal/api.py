@@ -91,18 +91,19 @@ class Diagnosis:
     """The closed loop: ``before`` is the linear calibration, ``calibration``
     the one to use, with the effects that were found; ``findings`` act for
     certain, ``candidates`` more likely than not, and ``probabilities`` has that
-    of every effect that was looked for; ``unexplained`` is what no effect
-    describes, ``held_out`` the error in poses that no fit saw, ``advice`` what
-    to do, an action a line, ``notes`` what else to know. ``call`` is whether the
-    calibration can be used. ``traces`` are what the poses show of each finding
-    and each candidate, against what drives it; `plot` draws them."""
+    of every effect that was looked for, None where it is not calibrated;
+    ``unexplained`` is what no effect describes, ``held_out`` the error in poses
+    that no fit saw, ``advice`` what to do, an action a line, ``notes`` what else
+    to know. ``call`` is whether the calibration can be used. ``traces`` are what
+    the poses show of each finding and each candidate, against what drives it;
+    `plot` draws them."""
 
     before: Calibration
     calibration: Calibration
     call: Recommendation
     findings: tuple[Finding, ...]
     candidates: tuple[Candidate, ...]
-    probabilities: Mapping[str, float]
+    probabilities: Mapping[str, float | None]
     unexplained: Unexplained
     next_recording: NextRecording
     held_out: HoldOut | None
@@ -274,14 +275,14 @@ def diagnose(
         closed_loop.call,
         closed_loop.findings,
         closed_loop.candidates,
-        closed_loop.probabilities,
+        closed_loop.stated,
         closed_loop.found.unexplained,
         following,
         closed_loop.held_out,
         tuple(diagnosis.advice(closed_loop, small)),
         tuple(diagnosis.notes(closed_loop, small)),
         closed_loop.traces,
-        diagnosis.lines(closed_loop, small, following),
+        diagnosis.lines(closed_loop, small, following, stated),
     )
 
 

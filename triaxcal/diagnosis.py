@@ -12,13 +12,14 @@ from functools import cached_property
 import numpy as np
 
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.corrected_calibration import corrected
-from triaxcal.evidence.findings import Findings, Named, findings
+from triaxcal.evidence.findings import Findings, Named, findings, stated
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.information_gain import Advice, advice, decided
 from triaxcal.evidence.model_average import Refusal, average, refusal
@@ -66,14 +67,15 @@ class Recommendation(StrEnum):
 class Finding:
     """An effect that acts for certain, alone or as the likeliest of
     ``alternatives``, each with its probability; ``together`` is that of at
-    least one of them. The ``coefficients`` are those that are corrected, or
+    least one of them. A probability is None where nothing tells that it is
+    calibrated (`Loop.stated`). The ``coefficients`` are those that are corrected, or
     else those if it is this effect that acts; ``remedy`` is how to be rid of
     it."""
 
     effect: str
     verdict: Verdict
-    probability: float
-    alternatives: Mapping[str, float]
+    probability: float | None
+    alternatives: Mapping[str, float | None]
     coefficients: Coefficients
     remedy: str
     together: float
@@ -82,11 +84,14 @@ class Finding:
 @dataclass(frozen=True)
 class Candidate:
     """An effect that acts more likely than not, and not for certain: with the
-    ``coefficients`` if it acts."""
+    ``coefficients`` if it acts. Its ``probability`` is that if the truth is in
+    the catalogue, which nobody knows, and so None (`Loop.stated`);
+    ``hangs_on_one_pose``: it would be certain but for some one pose."""
 
     effect: str
-    probability: float
+    probability: float | None
     coefficients: Coefficients
+    hangs_on_one_pose: bool = False
 
 
 @dataclass(frozen=True)
@@ -138,8 +143,22 @@ class Loop:
 
     @property
     def probabilities(self) -> Mapping[str, float]:
-        """That each effect acts, whatever else does, the likeliest first."""
+        """That each effect acts, whatever else does, the likeliest first; as the
+        posterior has it, in whose catalogue the truth is."""
         return self.posterior.effect_probabilities
+
+    @property
+    def stated(self) -> Mapping[str, float | None]:
+        """Those of the ``probabilities`` that are calibrated, else None. One that
+        is likely and not known is not: where the truth is in no catalogue, a
+        likely name is wrong."""
+        return stated(self.found, self.probabilities)
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a smooth function of the direction is corrected in the place
+        of names."""
+        return Empirical().name in self.after.terms
 
     @cached_property
     def advice(self) -> Advice:
@@ -207,14 +226,14 @@ def diagnose(
     hidden = not_identifiable(posterior.evidence, [e for e in effects if e.name not in faulty])
     before, after = (c.with_blind_to(tuple(hidden)) for c in (before, corrected(before, posterior, moment)))
     found, refused = findings(posterior), refusal(posterior)
-    report = _Report(posterior, moment, after)
+    report = _Report(posterior, moment, after, found)
     sound_check = None if check is None else [p for p in check if not p.fault]
     return Loop(
         before=before,
         after=after,
         found=found,
         findings=tuple(report.finding(named, refused) for named in found.named),
-        candidates=tuple(Candidate(n, p, report.if_it_acts(n)[0]) for n, p in found.candidates.items()),
+        candidates=tuple(report.candidate(name, p) for name, p in found.candidates.items()),
         refusal=refused,
         held_out=None if sound_check is None else held_out(before, after, sound_check),
         not_identifiable=hidden,
@@ -249,23 +268,30 @@ class _Report:
     posterior: Posterior
     moment: HoldsAt
     after: Calibration
+    found: Findings
     conditional: dict[str, Calibration] = field(default_factory=dict)
     """By name, as `if_it_acts` found them."""
 
     def finding(self, named: Named, refused: Refusal | None) -> Finding:
         probabilities = named.probabilities
         name, *others = probabilities
+        told = stated(self.found, probabilities)
         adopted = not others and refused is None
         coefficients, remedy = self._of(self.after, name) if adopted else self.if_it_acts(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
-            probability=probabilities[name],
-            alternatives={other: probabilities[other] for other in others},
+            probability=told[name],
+            alternatives={other: told[other] for other in others},
             coefficients=coefficients,
             remedy=remedy,
             together=named.together,
         )
+
+    def candidate(self, name: str, probability: float) -> Candidate:
+        told = stated(self.found, {name: probability})[name]
+        hangs = self.posterior.evidence.odds.hangs_on_one_pose(probability)
+        return Candidate(name, told, self.if_it_acts(name)[0], hangs)
 
     def if_it_acts(self, name: str) -> tuple[Coefficients, str]:
         made = average(self.posterior.conditional_on(name), self.moment)

@@ -227,7 +227,9 @@ class Calibration:
             self._require_inverse(rows, a, covariates)
         a = a.reshape(readings.shape)
         errors = (
-            uncertainty_of_readings(sensor, self._covariance(), rows, covariates).reshape(readings.shape)
+            uncertainty_of_readings(sensor, self._covariance(), rows, covariates, self._fitted.unmodelled).reshape(
+                readings.shape
+            )
             if uncertainty
             else None
         )
@@ -357,7 +359,7 @@ class Calibration:
         c = self._fitted
         u = np.array([p.mean for p in poses])
         covariates = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
-        return uncertainty_of_magnitude(c.sensor, self._covariance(), u, covariates)
+        return uncertainty_of_magnitude(c.sensor, self._covariance(), u, covariates, c.unmodelled)
 
     def _covariance(self) -> Floats:
         """(p,p) of the parameters, with what the budget has beside the fit."""

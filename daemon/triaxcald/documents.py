@@ -68,7 +68,7 @@ def loop_document(
     return {
         "format": "triaxcal.loop/1",
         "call": loop.call.value,
-        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)))),
+        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)), stated)),
         "before": residual_document(loop.before.residual, reference),
         "after": residual_document(loop.after.residual, reference),
         **({"held_out": _held_out(loop.held_out, reference)} if loop.held_out else {}),
@@ -76,12 +76,13 @@ def loop_document(
         "candidates": [
             {
                 "effect": c.effect,
-                "probability": chance(c.probability),
+                "probability": calibrated(c.probability),
+                "hangs_on_one_pose": c.hangs_on_one_pose,
                 "coefficients": coefficients_document(c.coefficients, reference_unit),
             }
             for c in loop.candidates
         ],
-        "probabilities": {name: chance(p) for name, p in loop.probabilities.items()},
+        "probabilities": {name: calibrated(p) for name, p in loop.stated.items()},
         "nothing_probability": chance(loop.found.nothing),
         "another_unit": _another(loop),
         "not_corrected": None if loop.refusal is None else loop.refusal.value,
@@ -156,14 +157,19 @@ def rezero_document(
     }
 
 
+def calibrated(probability: float | None) -> float | None:
+    """Null where it is not calibrated."""
+    return None if probability is None else chance(probability)
+
+
 def _finding(f: Finding, refusal: Refusal | None, reference_unit: str) -> Document:
     return {
         "effect": f.effect,
         "verdict": f.verdict.value,
-        "probability": chance(f.probability),
+        "probability": calibrated(f.probability),
         "coefficients": coefficients_document(f.coefficients, reference_unit),
         "alternatives": list(f.alternatives),
-        "probabilities": {name: chance(p) for name, p in f.alternatives.items()},
+        "probabilities": {name: calibrated(p) for name, p in f.alternatives.items()},
         "reason": diagnosis.reason(f, refusal),
         "remedy": f.remedy,
         **dict.fromkeys(NO_LONGER_OF_A_FINDING),

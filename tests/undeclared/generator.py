@@ -1,7 +1,8 @@
 """Recordings with an effect inside that nobody declares, and what is true of them.
 
 A recording is a random triad in random poses with random noise; the effect is one of `physics.KINDS`, one of
-`uncatalogued.KINDS`, of `invented.KINDS` or of `invented_later.KINDS`, two of the first ("two") or nothing ("none").
+`uncatalogued.KINDS`, of `invented.KINDS`, of `invented_later.KINDS` or of `further.KINDS`, two of the first ("two") or
+nothing ("none").
 Its size is s, see `visible`: what is drawn is scaled until s is what was asked for.
 """
 
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.undeclared import invented, invented_later, physics, uncatalogued
+from tests.undeclared import further, invented, invented_later, physics, uncatalogued
 from tests.undeclared.noise import Noise
 from tests.undeclared.physics import Effect
 from tests.undeclared.scene import (
@@ -31,7 +32,7 @@ from tests.undeclared.scene import (
 from tests.undeclared.visible import Linear, magnitude, nine_of, standard_errors
 from triaxcal.model.samples import Samples
 
-KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS, *invented_later.KINDS)
+KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS, *invented_later.KINDS, *further.KINDS)
 LARGEST_G = 0.05
 """An effect that adds more than this in any pose is no longer a small error of a sensor."""
 OF_TEMPERATURE = (
@@ -40,6 +41,8 @@ OF_TEMPERATURE = (
     "temperature_scale_factor",
     "thermal_gradient",
     "angle_by_temperature",
+    "temperature_cross_axis",
+    "gain_by_square_of_temperature",
 )
 LEAST_SWING_C = 0.2
 """No sensor shows an effect of a temperature that moves by less."""
@@ -136,9 +139,9 @@ def recording(
 def _effect(rng: np.random.Generator, name: str, here: Scene, channel: str, triad: Triad) -> Effect:
     if name in physics.KINDS:
         return physics.drawn(rng, name, here, channel)
-    for further in (invented, invented_later):
-        if name in further.KINDS:
-            return further.drawn(rng, name, here, triad)
+    for others in (invented, invented_later, further):
+        if name in others.KINDS:
+            return others.drawn(rng, name, here, triad)
     return uncatalogued.drawn(rng, name, here, triad)
 
 

@@ -16,6 +16,10 @@ KINDS = {"odd": 3, "even": 4, "time": 4}
 """Degree of each: the lowest odd and even ones that the nine parameters do not
 absorb, and of time a curve that bends three times; with more it would follow
 the noise."""
+SMOOTH = "smooth"
+DEGREES = (3, 4, 5, 6)
+"""Of a smooth function of the direction beside the nine parameters: what is
+finer, 26 poses do not show."""
 Terms = tuple[tuple[float, int, int, int], ...]
 """A polynomial: (factor, powers of x, y, z)."""
 Table = tuple[Ints, Floats]
@@ -27,8 +31,9 @@ one's factors (m,p)."""
 class Empirical(Effect):
     """``e = s f``: the magnitude is off by the share f, as a smooth function of
     the direction ("odd" and "even": the solid harmonics of degree 3 and 4 on
-    the unit sphere, the lowest that the nine parameters do not absorb), or of
-    the time ("time": a polynomial of degree 4 in thousands of seconds).
+    the unit sphere, the lowest that the nine parameters do not absorb; "smooth":
+    those of degree 3 to 6), or of the time ("time": a polynomial of degree 4 in
+    thousands of seconds).
     """
 
     kind: str = "odd"
@@ -41,6 +46,7 @@ class Empirical(Effect):
         factors={
             **{f"odd_{k}": "s × harmonic of degree 3" for k in range(1, 8)},
             **{f"even_{k}": "s × harmonic of degree 4" for k in range(1, 10)},
+            **{f"degree_{d}_{k}": f"s × harmonic of degree {d}" for d in DEGREES for k in range(1, 2 * d + 2)},
             **{f"time_{d}": f"s ((t − t₀) / 1000 s){p}" for d, p in ((1, ""), (2, "²"), (3, "³"), (4, "⁴"))},
         },
         symbols="f: a smooth function of the direction or of the time",
@@ -51,6 +57,8 @@ class Empirical(Effect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         if self.kind == "time":
             return tuple(Coefficient(f"time_{d}", f"1/ks{'⁰¹²³⁴'[d]}" if d > 1 else "1/ks") for d in range(1, 5))
+        if self.kind == SMOOTH:
+            return tuple(Coefficient(f"degree_{d}_{k}", "1") for d in DEGREES for k in range(1, 2 * d + 2))
         return tuple(Coefficient(f"{self.kind}_{k + 1}", "1") for k in range(len(harmonics(KINDS[self.kind]))))
 
     @property
@@ -59,36 +67,42 @@ class Empirical(Effect):
 
     @property
     def forms(self) -> tuple[Effect, ...]:
-        return tuple(Empirical(kind) for kind in KINDS)
+        return tuple(Empirical(kind) for kind in (*KINDS, SMOOTH))
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         if self.kind == "time":
             powers = (covariates[TIME][:, None] / 1000) ** np.arange(1, 5)
             return np.asarray(s[:, :, None] * powers[:, None, :])
-        values, _ = self._on_sphere(s)
+        values, _ = self._of_direction(s)
         return np.asarray(s[:, :, None] * values[:, None, :])
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         if self.kind == "time":
             powers = (covariates[TIME][:, None] / 1000) ** np.arange(1, 5)
             return np.asarray(np.eye(3)[None, :, :, None] * powers[:, None, None, :])
-        values, gradient = self._on_sphere(s)
+        values, gradient = self._of_direction(s)
         return np.asarray(
             np.eye(3)[None, :, :, None] * values[:, None, None, :] + s[:, :, None, None] * gradient[:, None]
         )
 
-    def _on_sphere(self, s: Floats) -> tuple[Floats, Floats]:
+    def _of_direction(self, s: Floats) -> tuple[Floats, Floats]:
         """Harmonics (n,p) of the direction of s, and their gradient (n,3,p) by
         s."""
-        degree = KINDS[self.kind]
-        length = np.linalg.norm(s, axis=1)
-        of_values, of_gradient = _tables(degree)
-        powers = np.cumprod(np.insert(np.repeat(s[:, :, None], degree, axis=2), 0, 1.0, axis=2), axis=2)
-        values = _valued(of_values, powers)
-        gradient = _valued(of_gradient, powers).reshape(len(s), 3, -1)
-        whole = length[:, None] ** degree
-        inward = degree * values[:, None, :] * s[:, :, None] / (length[:, None] ** (degree + 2))[:, :, None]
-        return values / whole, gradient / whole[:, :, None] - inward
+        degrees = DEGREES if self.kind == SMOOTH else (KINDS[self.kind],)
+        each = [_on_sphere(s, degree) for degree in degrees]
+        return np.concatenate([v for v, _ in each], axis=1), np.concatenate([g for _, g in each], axis=2)
+
+
+def _on_sphere(s: Floats, degree: int) -> tuple[Floats, Floats]:
+    """Harmonics (n,p) of one degree, and their gradient (n,3,p)."""
+    length = np.linalg.norm(s, axis=1)
+    of_values, of_gradient = _tables(degree)
+    powers = np.cumprod(np.insert(np.repeat(s[:, :, None], degree, axis=2), 0, 1.0, axis=2), axis=2)
+    values = _valued(of_values, powers)
+    gradient = _valued(of_gradient, powers).reshape(len(s), 3, -1)
+    whole = length[:, None] ** degree
+    inward = degree * values[:, None, :] * s[:, :, None] / (length[:, None] ** (degree + 2))[:, :, None]
+    return values / whole, gradient / whole[:, :, None] - inward
 
 
 @cache

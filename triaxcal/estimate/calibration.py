@@ -221,6 +221,16 @@ class BiasUpdate:
 
 
 @dataclass(frozen=True)
+class Unmodelled:
+    """Standard deviations, in units of the reference, of what acts on a reading
+    and no parameter describes: of |a| (``along`` the measured vector), and of
+    each component across it, which |a| does not show. rms over the sphere."""
+
+    along: float
+    across: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
@@ -237,7 +247,8 @@ class Calibration:
     effect where the coefficients are means over all that may act. Then
     ``prior_sd`` (p,) are the standard deviations of the coefficients before the
     poses were seen, and ``thermal`` (9+p,9+p) is the part of the covariance
-    that thermal effects make which the model has not. ``holds_at`` None:
+    that thermal effects make which the model has not. ``unmodelled`` is beside
+    the covariance: None where nobody asked, or nothing acts. ``holds_at`` None:
     effects of time count as long after the start, as in documents of 0.1.
     ``linear_only`` is the linear model fitted by itself, where there are
     effects and somebody asked for it. ``update`` is what it has of an earlier
@@ -262,6 +273,7 @@ class Calibration:
     weights: Mapping[str, float] = field(default_factory=dict)
     prior_sd: Floats | None = field(default=None, repr=False)
     thermal: Floats | None = field(default=None, repr=False)
+    unmodelled: Unmodelled | None = None
     holds_at: HoldsAt | None = None
     linear_only: Calibration | None = field(default=None, repr=False)
     update: BiasUpdate | None = field(default=None, repr=False)

@@ -16,7 +16,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.contract import Effect, is_derived
-from triaxcal.estimate.calibration import BiasUpdate, Calibration, Residual
+from triaxcal.estimate.calibration import BiasUpdate, Calibration, Residual, Unmodelled
 from triaxcal.model.directions import spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
@@ -71,6 +71,7 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
         thermal=None if c.thermal is None else through @ c.thermal @ through.T,
         prior_sd=None if c.prior_sd is None else c.prior_sd[own[9:]],
         weights={name: p for name, p in c.weights.items() if name in names},
+        unmodelled=_beside(c, sensor, through, u, covariates),
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
         update=None if c.update is None else _update(c.update, through),
     )
@@ -79,6 +80,21 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
 
 def _update(update: BiasUpdate, through: Floats) -> BiasUpdate:
     return replace(update, covariances={n: through @ v @ through.T for n, v in update.covariances.items()})
+
+
+def _beside(c: Calibration, sensor: Sensor, through: Floats, u: Floats, covariates: Mapping[str, Floats]) -> Unmodelled:
+    """What is unmodelled of a whole calibration, and by how much components
+    across the measured vector then differ from it: no magnitude makes up for
+    what they lose."""
+    a, _, by_all = c.sensor.specific_force_and_derivatives(u, covariates)
+    b, _, by_kept = sensor.specific_force_and_derivatives(u, covariates)
+    up = a / np.linalg.norm(a, axis=1, keepdims=True)
+    across = np.eye(3) - up[:, :, None] * up[:, None, :]
+    off = np.einsum("nij,nj->ni", across, a - b)
+    by = across @ (by_all - by_kept @ through)
+    square = np.sum(off**2, axis=1) + np.einsum("nip,pq,niq->n", by, c.covariance, by, optimize=True)
+    whole = c.unmodelled or Unmodelled(0.0, 0.0)
+    return Unmodelled(whole.along, float(np.sqrt(whole.across**2 + max(float(np.mean(square)), 0.0) / 2)))
 
 
 def _with_residual(c: Calibration) -> Calibration:

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats, rms
+from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
 from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
 from triaxcal.estimate.likelihood import State, linearise
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.mixture_components import components
-from triaxcal.evidence.model_average import Average, average, linear_alone, refusal
+from triaxcal.evidence.model_average import Average, least_loss
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.shape_posterior import shapes_of
 from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
@@ -24,12 +25,9 @@ from triaxcal.uncertainty.propagation import gain_given_prior
 def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibration:
     """With the likely effects at their mean coefficients. ``before`` is the
     linear calibration of all poses that were given: where no effect is to be
-    corrected (`refusal`), it stays, with the errors that all likely sets make
+    corrected (`least_loss`), it stays, with the errors that all likely sets make
     of it."""
-    mixture = components(posterior)
-    model_average = None if refusal(posterior) else average(posterior, at, mixture)
-    if model_average is None or not model_average.sensor.effects:
-        model_average = linear_alone(posterior, at, before.sensor, mixture)
+    model_average = least_loss(posterior, at, before.sensor, components(posterior))
     rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in model_average.sensor.effects for name in effect.needs)
     after = replace(
@@ -39,6 +37,7 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibra
         thermal=model_average.thermal,
         prior_sd=model_average.prior_sd,
         weights=model_average.weights,
+        unmodelled=model_average.unmodelled,
         shape_errors=_shape_errors(posterior, model_average),
         channel_reference={name: rows.problem.channel_reference[name] for name in needed},
         birge_ratio=1.0,
@@ -110,6 +109,8 @@ def _with_known_residuals(
         )
         for i, p in enumerate(c.poses)
     )
+    if Empirical().name in c.terms:  # whose linear part is a fit of its own: no one knows how much a pose decides
+        return replace(c, residual=Residual.of(r[of_used], error[of_used]), poses=results)
     own, noise, left = r[of_used], error[of_used], len(used) - float(leverage.sum())
     pure = within_pose_dof([poses[i] for i in of_used])
     residual = Residual.of(

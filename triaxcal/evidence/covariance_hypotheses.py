@@ -15,7 +15,7 @@ from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.row_covariance import LowRank, RowPrecision
 from triaxcal.evidence.term_columns import TermColumns, WeightedColumns
-from triaxcal.evidence.unmodelled_kernels import OWN, UnmodelledCovariance, kinds_of
+from triaxcal.evidence.unmodelled_kernels import OWN, UnmodelledCovariance, kinds_of, local_kinds_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +28,27 @@ class UnmodelledPart:
     log_prior: float
 
 
-def parts_of(rows: LinearisedData, odds: Odds) -> list[UnmodelledPart]:
+def parts_of(rows: LinearisedData, odds: Odds, suspects: Sequence[int] | None = None) -> list[UnmodelledPart]:
     """The first is that there is none. What goes through all poses is no larger
     over the sphere than an effect may be: poses that show little of it, as half
-    a sphere does, leave it open whether it is there."""
+    a sphere does, leave it open whether it is there. Parts that a few poses
+    alone show are among them where some of these are ``suspects``: may be
+    outliers."""
     kinds = kinds_of(rows)
     sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
     share = float(np.log(odds.unmodelled_probability / len(kinds) / len(sizes)))
     none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled_probability)))
     largest = odds.largest_g * rows.problem.reference
-    some = [(kind, tau) for kind in kinds for tau in sizes if kind.what in OWN or tau * kind.whole <= largest]
-    return [none, *(UnmodelledPart(kind, float(tau), share) for kind, tau in some)]
+
+    def sized(kinds: Sequence[UnmodelledCovariance], share: float) -> list[UnmodelledPart]:
+        some = ((kind, tau) for kind in kinds for tau in sizes if kind.what in OWN or tau * kind.whole <= largest)
+        return [UnmodelledPart(kind, float(tau), share) for kind, tau in some]
+
+    parts = [none, *sized(kinds, share)]
+    if suspects is None:
+        return parts
+    local = local_kinds_of(rows, suspects)
+    return [*parts, *sized(local, float(np.log(odds.local_probability / max(len(local), 1) / len(sizes))))]
 
 
 @dataclass(frozen=True, eq=False)

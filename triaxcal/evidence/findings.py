@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.rounding import reaches
 
@@ -65,6 +66,16 @@ class Findings:
     unexplained: Unexplained
     change_point: ChangePoint | None
     nothing: float
+
+
+def stated(found: Findings, probabilities: Mapping[str, float]) -> dict[str, float | None]:
+    """Each of these ``probabilities`` of names, or None where it is not
+    calibrated. The odds before the poses were seen have the truth in the
+    catalogue; where it is in none, a name that is likely and not known is wrong
+    (`benchmarks.components`)."""
+    known = {named.effect for named in found.named if named.unique}
+    least = Odds().reported
+    return {name: p if name in known or not reaches(p, least) else None for name, p in probabilities.items()}
 
 
 def findings(posterior: Posterior) -> Findings:

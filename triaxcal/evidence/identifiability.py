@@ -8,10 +8,17 @@ from enum import StrEnum
 
 import numpy as np
 
+from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
 from triaxcal.evidence.marginal_likelihood import Evidence
+from triaxcal.evidence.unmodelled_kernels import reading_geometry
+from triaxcal.model.directions import spiral
 from triaxcal.planning.design import VISIBLE
 from triaxcal.poses.covariates import static_covariates
+
+SAME = 0.1
+"""Of the largest combination of coefficients all over the sphere: two that
+differ in |a| by less do so by the misalignments of the axes, and look the same."""
 
 
 class Why(StrEnum):
@@ -47,16 +54,30 @@ def not_identifiable(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping
 
 def _in_full(evidence: Evidence, name: str) -> bool:
     """Whether no combination of all the coefficients of some shape looks like
-    the nine parameters."""
+    the nine parameters; apart from those that |a| shows nowhere."""
     rows = evidence.rows
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
-            columns = np.asarray(term.columns)
+            columns = np.asarray(term.columns) @ _shown_somewhere(evidence, term.effect)
             columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
             left = rows.beyond_linear(columns)
-            if rows.residual_dof >= term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
+            if rows.residual_dof >= columns.shape[1] and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
                 return True
     return False
+
+
+def _shown_somewhere(evidence: Evidence, effect: Effect) -> Floats:
+    """(p,r) combinations of the coefficients, of which |a| shows each somewhere
+    on the sphere. Of an effect that needs a covariate it shows all."""
+    p = len(effect.coefficients)
+    if effect.needs:
+        return np.eye(p)
+    rows = evidence.rows
+    sensor = rows.state.sensor(rows.problem)
+    geometry = reading_geometry(rows, sensor.output(spiral(4 * p) * rows.problem.reference, {}))
+    shown = np.einsum("ni,nip->np", geometry.by_bias, effect.basis(geometry.along, {}))
+    size, combinations = np.linalg.svd(shown, full_matrices=False)[1:]
+    return np.asarray(combinations[size > SAME * size[0]].T)
 
 
 def _why(evidence: Evidence, effect: Effect) -> NotIdentifiable:

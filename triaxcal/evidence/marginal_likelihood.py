@@ -64,15 +64,18 @@ class Evidence:
     all, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
     effects in g."""
 
-    def __init__(self, rows: LinearisedData, terms: Sequence[Term], odds: Odds) -> None:
-        """Sizes begin at that share of the noise of a pose which the odds have."""
+    def __init__(
+        self, rows: LinearisedData, terms: Sequence[Term], odds: Odds, suspects: Sequence[int] | None = None
+    ) -> None:
+        """Sizes begin at that share of the noise of a pose which the odds have;
+        ``suspects`` as in `parts_of`."""
         self.rows, self.odds = rows, odds
         self.columns = TermColumns.of([term.columns for term in terms], len(rows.y))
         self.terms = [
             replace(term, columns=columns)
             for term, columns in zip(terms, self.columns.shared([term.columns for term in terms]), strict=True)
         ]
-        self.parts = parts_of(rows, odds)
+        self.parts = parts_of(rows, odds, suspects)
         self._begin_sizes(odds.smallest * rows.median_standard_error)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])

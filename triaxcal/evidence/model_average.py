@@ -17,10 +17,12 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.contract import Effect
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.effects.empirical import Empirical
+from triaxcal.estimate.calibration import HoldsAt, Unmodelled
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
-from triaxcal.evidence.average_spread import Spread
+from triaxcal.evidence.average_spread import BIAS, Spread, smooth_mean
 from triaxcal.evidence.mixture_components import NEGLIGIBLE_PROBABILITY, Components, components
+from triaxcal.evidence.over_sphere import OverSphere
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.reported_parameters import Projection
 from triaxcal.evidence.row_covariance import inverse_of
@@ -62,13 +64,16 @@ class Average:
     the part of sets with a thermal effect that is not listed; ``prior_sd`` (p,)
     are the coefficients' standard deviations before the poses were seen, as the
     probabilities and sizes after have them. ``weights`` has the probability of
-    each name."""
+    each name. ``loss`` is the expected mean square of |a| over the sphere in
+    the next recording, over the error of a pose, NaN where nobody asked."""
 
     sensor: Sensor
     covariance: Floats
     thermal: Floats
     prior_sd: Floats
     weights: Mapping[str, float]
+    unmodelled: Unmodelled | None
+    loss: float
 
 
 def refusal(posterior: Posterior) -> Refusal | None:
@@ -84,23 +89,70 @@ def refusal(posterior: Posterior) -> Refusal | None:
 
 
 def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | None = None) -> Average:
-    """Over all sets, sizes and parts; it holds for another recording as at a
-    moment of this one. ``mixture`` are the likeliest sets (`components`), where
-    they are known."""
-    listed, mixture = _likeliest(posterior), components(posterior) if mixture is None else mixture
-    made = _of_listed(posterior, at, listed, mixture)
+    """Over all sets, sizes and parts, of what has a name; it holds for another
+    recording as at a moment of this one. ``mixture`` are the likeliest sets
+    (`components`), where they are known."""
+    mixture = components(posterior) if mixture is None else mixture
+    return _of_likely(posterior, None, at, mixture)
+
+
+def least_loss(posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]) -> Average:
+    """What is handed on: of the ``linear`` sensor and the averages that the
+    posterior allows (`refusal`) the one with the least expected error."""
+    sphere = OverSphere.of(posterior, at, mixture)
+    alone = _linear_alone(posterior, at, linear, mixture, sphere)
+    why = refusal(posterior)
+    if why is None:
+        made = _of_likely(posterior, sphere, at, mixture)
+        return made if made.sensor.effects else alone
+    if why is not Refusal.UNMODELLED:
+        return alone
+    whole = _smooth(posterior, sphere, at, linear, mixture)
+    return whole if whole.loss <= posterior.evidence.odds.gain * alone.loss else alone
+
+
+def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mixture: Sequence[Components]) -> Average:
+    listed = _likeliest(posterior)
+    made = _of_listed(posterior, sphere, at, listed, mixture)
     kept = [effect for effect in listed if _selected(posterior, made, effect)]
-    return made if len(kept) == len(listed) else _of_listed(posterior, at, kept, mixture)
+    return made if len(kept) == len(listed) else _of_listed(posterior, sphere, at, kept, mixture)
 
 
-def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], mixture: Sequence[Components]) -> Average:
+def _of_listed(
+    posterior: Posterior,
+    sphere: OverSphere | None,
+    at: HoldsAt,
+    listed: Sequence[Effect],
+    mixture: Sequence[Components],
+) -> Average:
     projection = Projection.of(posterior, at, listed)
     mean, left = _mean(posterior, projection)
     state = _where_linearised(posterior, mean, projection)
     sensor = state.sensor(posterior.evidence.rows.problem)
     process_bias = _process_bias(posterior, left, at.t_s)
     moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + process_bias, sensor.effects)
-    return _with_errors(posterior, at, projection, moved, state, mean, process_bias, mixture)
+    return _with_errors(posterior, sphere, at, projection, moved, state, mean, process_bias, mixture)
+
+
+def _smooth(
+    posterior: Posterior, sphere: OverSphere, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]
+) -> Average:
+    """The ``linear`` sensor with the mean of all functions of the direction,
+    and its nine parameters as they come out beside that. Between the poses a
+    function of the direction is interpolated; what a mixture without the truth
+    says of other conditions is not known to hold there."""
+    rows = posterior.evidence.rows
+    projection = Projection.of(posterior, at, [e for e in _likeliest(posterior) if not e.needs])
+    coefficients = _mean(posterior, projection)[0][LINEAR:]
+    further = smooth_mean(posterior, mixture, projection, sphere)
+    projection, coefficients = projection.beside(posterior, sphere.smooth), np.concatenate([coefficients, further])
+    used = np.flatnonzero(posterior.outlier_probabilities < posterior.evidence.odds.reported)
+    taken = np.linalg.lstsq(rows.linear[used], (projection.columns @ coefficients)[used], rcond=None)[0]
+    alone = State.of(rows.problem, linear).theta - rows.state.theta
+    mean = np.concatenate([alone - taken / rows.lengths, coefficients])
+    state = _where_linearised(posterior, mean, projection)
+    sensor = state.sensor(rows.problem)
+    return _with_errors(posterior, sphere, at, projection, sensor, state, mean, np.zeros(3), mixture)
 
 
 def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
@@ -117,17 +169,20 @@ def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
     return corrects >= SELECTED_LEAST * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
-def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]) -> Average:
+def _linear_alone(
+    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components], sphere: OverSphere
+) -> Average:
     """The ``linear`` sensor with the errors that all likely sets make of it:
     what is handed on where no effect is corrected."""
     rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
     projection, mean = Projection.of(posterior, at, []), state.theta - rows.state.theta
-    return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), mixture)
+    return _with_errors(posterior, sphere, at, projection, linear, state, mean, np.zeros(3), mixture)
 
 
 def _with_errors(
     posterior: Posterior,
+    sphere: OverSphere | None,
     at: HoldsAt,
     projection: Projection,
     sensor: Sensor,
@@ -137,9 +192,27 @@ def _with_errors(
     mixture: Sequence[Components],
 ) -> Average:
     G = parameters_by_theta(posterior.evidence.rows.problem, state)
-    spread = Spread.of(posterior, mixture, mean, projection, process_bias, at.t_s)
-    weights = {effect.name: posterior.effect_probabilities[effect.name] for effect in projection.effects}
-    return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights)
+    smooth = sphere if sphere is not None and sphere.smooth in projection.effects else None
+    spread = Spread.of(posterior, mixture, mean, projection, process_bias, at.t_s, smooth)
+    probabilities = {**posterior.effect_probabilities, Empirical().name: posterior.unmodelled_probability}
+    weights = {effect.name: probabilities[effect.name] for effect in projection.effects}
+    loss, unmodelled = float("nan"), None
+    if sphere is not None:
+        J, reported = sphere.by_parameters(posterior, projection.effects), mean.copy()
+        reported[BIAS] += process_bias
+        loss = sphere.loss(J @ reported)
+        # What the covariance of the parameters does not hold of |a|.
+        beside = loss - float(np.einsum("mi,ij,mj->", J, spread.whole, J, optimize=True)) / len(J)
+        unmodelled = _noticeable(np.array([beside, sphere.across]), sphere.there.error)
+    return Average(
+        sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, unmodelled, loss
+    )
+
+
+def _noticeable(square: Floats, error: float) -> Unmodelled | None:
+    """Of mean squares over the ``error`` of a pose."""
+    along, across = np.sqrt(np.maximum(square, 0.0)) * (square > NOTICEABLE**2) * error
+    return Unmodelled(float(along), float(across)) if along or across else None
 
 
 def _likeliest(posterior: Posterior) -> list[Effect]:

@@ -31,6 +31,10 @@ class Odds:
     unmodelled_probability: float = 0.2
     """That something acts that no name describes, shared evenly among its
     kinds."""
+    local_probability: float = 0.001
+    """That something acts near one end of an axis, or in one direction, shared
+    among these: less than one outlier, so that a single pose stays one, and more
+    than two, so that those that share a direction do not."""
     change_point_odds: float = 0.005
     """That one calibration does not hold in all poses: a unit exchanged, or its
     channels, in one of two hundred."""
@@ -62,6 +66,15 @@ class Odds:
     refused: float = 0.5
     """Where an unmodelled part is likelier than not, or a name would be
     unlikelier than not without some one pose, no effect is corrected."""
+    gain: float = 0.5
+    """Of the expected mean square of |a| under the linear model: where a
+    correction of what no name describes leaves more, it is not made. Half is a
+    margin: the covariances are those of nobody's sensor, and memory or time may
+    look like a function of the direction."""
+    another_form: float = 0.2
+    """Of the mean square of what a named function of the force may do across
+    the measured vector, where |a| does not tell how axes share it: that its
+    name is another's."""
     together: int = 3
     """Effects and outliers at once, at most."""
     relinearise_chi2: float = 1.0

@@ -55,6 +55,7 @@ def posterior_of(
     effects = considered(poses, catalogue)
     rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
     near: int | None = None
+    suspects: list[int] | None = None
     done = 0
 
     def told(share: float) -> None:
@@ -62,15 +63,25 @@ def posterior_of(
 
     while True:
         told(0.0)
-        evidence = Evidence(rows, terms_of(rows, effects, odds, finer, near), odds)
+        evidence = Evidence(rows, terms_of(rows, effects, odds, finer, near), odds, suspects)
         posterior = Posterior(evidence, likely_sets(evidence, told))
         done += 1
         point, split = _point_of(posterior), finer_shapes(posterior)
         seen, near = near, coarse_change_point(posterior, near)
-        if done == ROUNDS or (point is None and not split and near == seen):
+        asked, suspects = suspects, _suspects(posterior) if suspects is None else suspects
+        if done == ROUNDS or (point is None and not split and near == seen and asked == suspects):
             return posterior
         del posterior, evidence  # of a thousand poses it holds much memory, and so will the next
         rows, finer = rows if point is None else rows.relinearised_at(point), [*finer, split]
+
+
+def _suspects(posterior: Posterior) -> list[int] | None:
+    """Poses that are outliers, or none of them where another unit is likely:
+    then something that acts there alone is an alternative, which is asked about
+    no sooner. None where neither is likely."""
+    outliers, least = posterior.outlier_probabilities, posterior.evidence.odds.reported
+    found = [i for i, p in enumerate(outliers) if reaches(p, least)]
+    return found if found or reaches(posterior.change_point_probabilities.sum(), least) else None
 
 
 def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:

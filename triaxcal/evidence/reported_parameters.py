@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.unmodelled_kernels import reading_geometry
+from triaxcal.evidence.unmodelled_kernels import ReadingGeometry, reading_geometry
 from triaxcal.model.directions import cube_directions
 from triaxcal.poses.covariates import at_moment
 
@@ -35,7 +34,7 @@ class Projection:
     def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> Projection:
         evidence = posterior.evidence
         rows = evidence.rows
-        there = _next_readings(posterior, at)
+        there = NextReadings.of(posterior, at, np.array([v for _, v in cube_directions()]))
         each = [_derivatives(posterior, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
         linear = np.concatenate([rows.linear, there.linear])
@@ -50,13 +49,28 @@ class Projection:
             k = of_name.get(term.name)
             to = nothing if k is None else each[k]
             if id(term.effect) not in known:
-                known[id(term.effect)] = _projected(linear, to, _derivatives(posterior, term.effect, there))
+                itself = k is not None and likeliest[k] is term.effect
+                known[id(term.effect)] = (
+                    np.eye(9 + to.shape[1], to.shape[1], -9)
+                    if itself
+                    else _projected(linear, to, _derivatives(posterior, term.effect, there))
+                )
             found = known[id(term.effect)][:, list(term.kept)] * term.combination
-            own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
-            by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
+            own: list[int] = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
+            by_term[np.ix_(np.array([*range(9), *own]), evidence.places([i]))] = found
         by_term[:9] /= rows.lengths[:, None]
         columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
         return cls(tuple(likeliest), columns, by_term)
+
+    def beside(self, posterior: Posterior, effect: Effect) -> Projection:
+        """With a further effect, which no term projects onto."""
+        own = posterior.evidence.rows.by_coefficients(effect)
+        nothing = np.zeros((own.shape[1], self.by_term.shape[1]))
+        return Projection(
+            (*self.effects, effect),
+            np.concatenate([self.columns, own], axis=1),
+            np.concatenate([self.by_term, nothing]),
+        )
 
 
 def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
@@ -68,33 +82,36 @@ def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
     return np.asarray(found)
 
 
-def _derivatives(posterior: Posterior, effect: Effect, there: _NextReadings) -> Floats:
+def _derivatives(posterior: Posterior, effect: Effect, there: NextReadings) -> Floats:
     """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of
     |a| in the next recording."""
-    rows = posterior.evidence.rows
-    try:
-        basis = effect.basis(there.along, there.covariates)
-        of_radius = np.einsum("ni,nip->np", there.by_bias, basis) / rows.median_standard_error
-    except EffectFault:  # of another package, which does not say what it adds there
-        of_radius = np.zeros((len(there.along), len(effect.coefficients)))
-    return np.concatenate([rows.by_coefficients(effect), of_radius])
+    return np.concatenate([posterior.evidence.rows.by_coefficients(effect), there.by_coefficients(effect)])
 
 
-class _NextReadings(NamedTuple):
-    """M readings all over the sphere, as of the next recording: derivatives of
-    |a| by the ``linear`` parameters (M,9) over the error of a pose and by the
-    biases (M,3), readings ``along`` the axes (M,3), and the covariates."""
+@dataclass(frozen=True, eq=False)
+class NextReadings:
+    """M readings, as of the next recording: their ``geometry``, derivatives of
+    |a| by the ``linear`` parameters (M,9), and the ``covariates``. All of |a| is
+    over the ``error`` of a pose."""
 
+    geometry: ReadingGeometry
     linear: Floats
-    by_bias: Floats
-    along: Floats
     covariates: Mapping[str, Floats]
+    error: float
 
+    @classmethod
+    def of(cls, posterior: Posterior, at: HoldsAt, directions: Floats) -> NextReadings:
+        rows = posterior.evidence.rows
+        up = directions * rows.problem.reference
+        found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
+        covariates = at_moment(rows.problem.channel_reference, len(up), at.clocks)
+        error = rows.median_standard_error
+        return cls(found, found.linear / error, covariates, error)
 
-def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
-    rows = posterior.evidence.rows
-    up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
-    found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
-    reference = rows.problem.channel_reference
-    covariates = at_moment(reference, len(up), at.clocks)
-    return _NextReadings(found.linear / rows.median_standard_error, found.by_bias, found.along, covariates)
+    def by_coefficients(self, effect: Effect) -> Floats:
+        """(M,p)"""
+        try:
+            basis = effect.basis(self.geometry.along, self.covariates)
+            return np.asarray(np.einsum("ni,nip->np", self.geometry.by_bias, basis) / self.error)
+        except EffectFault:  # of another package, which does not say what it adds there
+            return np.zeros((len(self.geometry.along), len(effect.coefficients)))

@@ -150,8 +150,10 @@ def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Eff
 def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | None:
     """Derivatives of the rows by the coefficients (N,p), and the size of each
     (p,): the rms of what a coefficient of one adds over the sphere and over the
-    poses' covariates, about its mean over these. None where it cannot be
-    determined."""
+    poses' covariates, about its mean over these. Of one part of a function of
+    the force alone, coefficients in one unit are equally probable before the
+    poses are seen, and so have the rms of their sizes: they may look the same
+    in |a|. None where it cannot be determined."""
     try:
         columns = rows.by_coefficients(effect)
         covariates = rows.problem.covariates
@@ -166,7 +168,11 @@ def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | No
         return None
     if effect.needs:
         basis = basis - basis.mean(axis=0, keepdims=True)
-    return columns, np.sqrt(np.mean(np.sum(basis**2, axis=2), axis=(0, 1)))
+    square = np.mean(np.sum(basis**2, axis=2), axis=(0, 1))
+    if not effect.needs:
+        alike = [(c.part, c.unit) for c in effect.coefficients]
+        square = np.array([np.mean([square[k] for k, other in enumerate(alike) if other == one]) for one in alike])
+    return columns, np.sqrt(square)
 
 
 def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:

@@ -8,7 +8,7 @@ would come out two or three times worse.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -37,6 +37,10 @@ MEMORY = 0.8
 """Of the reference vector, by the pose before."""
 IN_TIME = (0.1, 0.3)
 """Of the recording's duration."""
+KNEES = (0.7, 0.8, 0.9)
+"""Of the reference vector: where what acts near one end of an axis begins."""
+NEAR = 0.3
+"""On the sphere, of unit radius: how far what acts in one direction reaches."""
 ABSORBED = 1e-9
 """A kind is dropped if projection off the nine parameters leaves less than this
 share of its covariance. An example is time, where the times of the poses are
@@ -56,6 +60,9 @@ class UnmodelledKind(StrEnum):
     EVEN = "even_by_axis"
     POSE_BEFORE = "pose_before"
     TIME = "time"
+    LOCAL = "local"
+    """Near one end of an axis, or in one direction: a few poses that share it
+    alone show it."""
     WITHIN_POSE = "inside_poses"
     """The slopes alone, as by noise of a logged channel."""
 
@@ -171,10 +178,24 @@ def duration_of(rows: LinearisedData) -> float:
 
 
 def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
+    sphere = _Sphere.of(rows)
+    return _whitened(rows, sphere, _covariances(rows, sphere))
+
+
+def local_kinds_of(rows: LinearisedData, suspects: Sequence[int]) -> list[UnmodelledCovariance]:
+    """What acts near an end of an axis, or about the direction of one of the
+    ``suspects``: poses that may be outliers."""
+    sphere = _Sphere.of(rows)
+    return _whitened(rows, sphere, _local(rows, sphere, suspects))
+
+
+def _whitened(
+    rows: LinearisedData, sphere: _Sphere, covariances: Iterable[tuple[UnmodelledKind, float, _Between]]
+) -> list[UnmodelledCovariance]:
     found = []
-    here, sphere = PoseInputs.of(rows), _Sphere.of(rows)
+    here = PoseInputs.of(rows)
     everywhere = _everywhere(sphere.everywhere, rows.slopes)
-    for what, length, between in _covariances(rows, sphere):
+    for what, length, between in covariances:
         variances = _variances(between, here)
         of_rows = OwnVariances(variances) if what in OWN else LowRank(_factor(between, here, variances))
         shown = float(of_rows.beyond(rows.basis).sum())
@@ -240,6 +261,19 @@ def _covariances(rows: LinearisedData, sphere: _Sphere) -> Iterator[tuple[Unmode
         yield UnmodelledKind.TIME, share, partial(_in_time, length=share * duration_of(rows))
     if rows.slopes:
         yield UnmodelledKind.WITHIN_POSE, 0.0, _own_of_slopes
+
+
+def _local(
+    rows: LinearisedData, sphere: _Sphere, suspects: Sequence[int]
+) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
+    reference = rows.problem.reference
+    for axis in range(3):
+        for end in (1.0, -1.0):
+            of = partial(_beyond_knees, axis=axis, end=end, reference=reference)
+            yield UnmodelledKind.LOCAL, reference, sphere.covariance(of)
+    up = reading_geometry(rows, rows.problem.u).up
+    for pose in suspects:
+        yield UnmodelledKind.LOCAL, NEAR, sphere.covariance(partial(_about, centre=up[pose]))
 
 
 def _same(p: PoseInputs, q: PoseInputs) -> Floats:
@@ -347,3 +381,15 @@ def _by_axis(p: ReadingGeometry, q: ReadingGeometry, sign: int, length: float) -
         mirrored = np.exp(-((p.along[:, None, i] + q.along[None, :, i]) ** 2) / 2 / length**2)
         total += np.outer(p.by_bias[:, i], q.by_bias[:, i]) * (same + sign * mirrored)
     return total
+
+
+def _beyond_knees(p: ReadingGeometry, q: ReadingGeometry, axis: int, end: float, reference: float) -> Floats:
+    """A bend of one axis at one end, beyond a knee that nobody knows."""
+    here, there = (end * g.along[:, axis, None] / reference - KNEES for g in (p, q))
+    bent = np.maximum(here, 0.0) @ (np.maximum(there, 0.0) / (1 - np.array(KNEES)) ** 2).T
+    return np.asarray(np.outer(p.by_bias[:, axis], q.by_bias[:, axis]) * bent)
+
+
+def _about(p: ReadingGeometry, q: ReadingGeometry, centre: Floats) -> Floats:
+    here, there = (np.exp(-np.sum((g.up - centre) ** 2, axis=1) / 2 / NEAR**2) for g in (p, q))
+    return np.asarray(np.outer(here, there) * _smooth(p, q, NEAR))

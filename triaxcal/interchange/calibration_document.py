@@ -8,7 +8,15 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import BiasUpdate, Calibration, Exclusion, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import (
+    BiasUpdate,
+    Calibration,
+    Exclusion,
+    HoldsAt,
+    PoseResult,
+    Residual,
+    Unmodelled,
+)
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -24,6 +32,7 @@ from triaxcal.rounding import (
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcal.uncertainty.budget_statements import Basis, UnmodelledTemperature
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
@@ -126,8 +135,10 @@ def calibration_document(
         "standard_error": {name: group(name) for name in LINEAR},
         "parameters": list(c.parameters),
         "correlation": correlation(c.covariance),
+        **({} if c.unmodelled is None else {"unmodelled": _unmodelled(c.unmodelled)}),
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
+        **({} if evaluated is None else {"expanded_uncertainty_g": _scopes(c, evaluated)}),
         "residual": residual_document(c.residual, c.reference),
         "poses": _poses(c),
         "trends": c.slopes,
@@ -192,6 +203,17 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
         **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
         "channels": {name: number(v) for name, v in p.pose.channels.items()},
     }
+
+
+def _scopes(c: Calibration, evaluated: Budget) -> Document:
+    """Of |a|, by the readings that it is of."""
+    scopes = Scopes.of(c, evaluated, next_recording(c, evaluated))
+    return {name.replace("'", "").replace(" ", "_"): uncertainty(value) for name, value in scopes.named.items()}
+
+
+def _unmodelled(part: Unmodelled) -> Document:
+    """Beside the standard errors and their correlation."""
+    return {"along_g": uncertainty(part.along), "across_g": uncertainty(part.across)}
 
 
 def _holds_at(moment: HoldsAt | None) -> Document | None:

@@ -13,7 +13,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
+from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual, Unmodelled
 from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.moment import Moment
@@ -122,6 +122,7 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
         weights={
             name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := number_in(held.get(WEIGHT)))
         },
+        unmodelled=unmodelled_of(part, where=where),
         holds_at=holds_at_of(part, where=where),
     )
 
@@ -141,6 +142,17 @@ def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Flo
     if correlation is None:
         return np.diag(sigma**2)
     return np.asarray(correlation * np.outer(sigma, sigma))
+
+
+def unmodelled_of(part: Mapping[str, Any], *, where: str) -> Unmodelled | None:
+    """Raises InvalidData."""
+    held = part.get("unmodelled")
+    if held is None:
+        return None
+    along, across = (number_in(held.get(k)) if isinstance(held, Mapping) else math.nan for k in ("along_g", "across_g"))
+    if not (0 <= along < math.inf and 0 <= across < math.inf):
+        raise InvalidData(f"{where}: unmodelled: expected along_g and across_g, numbers of at least 0")
+    return Unmodelled(along, across)
 
 
 def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:

@@ -26,7 +26,9 @@ GOES_WITH = {
     UnmodelledKind.EVEN: "the size of an axis's reading",
     UnmodelledKind.POSE_BEFORE: "the pose before",
     UnmodelledKind.TIME: "the time",
+    UnmodelledKind.LOCAL: "one direction, or one end of an axis, which a few poses share",
 }
+BY_DIRECTION = " by its name, but the mean over all that may act, as a smooth function of the direction"
 REFUSED = {
     Refusal.UNMODELLED: "something that no effect describes acts as well",
     Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
@@ -76,7 +78,7 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
 def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     """What else to know, a line each: nothing that anybody has to do."""
     if loop.refusal is not None:
-        yield f"no effect is corrected, because {REFUSED[loop.refusal]}"
+        yield f"no effect is corrected{BY_DIRECTION if loop.smooth else ''}, because {REFUSED[loop.refusal]}"
     for name, expected in loop.advice.expected.items():
         yield (
             f"{name}: probability {chance(expected.now)} now, {chance(expected.if_it_acts)} expected after the poses "

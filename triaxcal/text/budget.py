@@ -58,6 +58,11 @@ def _(b: of.NotHeld) -> str:
 
 
 @basis.register
+def _(b: of.NoParameter) -> str:
+    return "what acts in some direction and no parameter describes, as probable and as large as the poses leave it"
+
+
+@basis.register
 def _(b: of.AveragedModels) -> str:
     which = f"; {', '.join(b.names)} may act or not" if b.names else ""
     return f"the spread over all that may act, each by its probability{which}"

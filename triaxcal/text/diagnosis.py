@@ -5,17 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import numpy as np
+
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.estimate.calibration import Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
-from triaxcal.evidence.prior import Odds
-from triaxcal.number_format import plain
+from triaxcal.number_format import number_of, plain
 from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_do
+from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import NextRecording, Source
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]
@@ -31,16 +34,22 @@ CALLS = {
 }
 
 
-def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) -> tuple[str, str, str, str]:
+def lines(
+    loop: Loop, small: ErrorUnit, following: NextRecording | None = None, stated: Stated | None = None
+) -> tuple[str, str, str, str]:
     """The whole in four lines: the call, the cause, the error before and after,
-    and what to do. ``following`` is the next recording where a station knows
-    more of the reference than the poses tell."""
+    and what to do. ``following`` is the next recording where a station has
+    ``stated`` more of the reference than the poses tell. What a check recording
+    contradicts comes first."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
-    acts = cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities, loop.averaged)
+    following = following or loop.next_recording
+    scopes = Scopes.of(loop.after, budget(loop.after, stated), following)
+    against = contradiction(loop, scopes, small)
+    before, after = loop.before.residual, loop.after.residual
     return (
-        call(loop.call),
-        acts,
-        errors(loop.before.residual, loop.after.residual, loop.held_out, following or loop.next_recording, small),
+        f"{against}; {call(loop.call)}" if against else call(loop.call),
+        cause(loop.found, loop.findings, loop.candidates, began, small, loop.stated, loop.averaged),
+        errors(before, after, loop.held_out, scopes, following, small) + excluded(loop, small),
         to_do(loop, small),
     )
 
@@ -60,7 +69,7 @@ def cause(
     candidates: Sequence[Candidate],
     began: Mapping[int, PoseStart],
     small: ErrorUnit,
-    probabilities: Mapping[str, float],
+    probabilities: Mapping[str, float | None],
     weights: Mapping[str, float] | None = None,
 ) -> str:
     """What acts, each with its probability; ``began`` says when the poses
@@ -73,13 +82,15 @@ def cause(
     return "; ".join([*(said or [_nothing_named(found, probabilities, weights)]), *mean])
 
 
-def _nothing_named(found: Findings, probabilities: Mapping[str, float], weights: Mapping[str, float] | None) -> str:
+def _nothing_named(
+    found: Findings, probabilities: Mapping[str, float | None], weights: Mapping[str, float] | None
+) -> str:
     if found.nothing >= EVEN:
         shows = "is likely" if weights else "shows"
         return f"no effect {shows} (nothing acts with probability {chance(found.nothing)})"
-    likely = [f"{name} ({chance(p)})" for name, p in probabilities.items()][:LIKELIEST]
+    names = [likely(name, p) for name, p in probabilities.items()][:LIKELIEST]
     none = f"something that no effect describes ({chance(found.unexplained.probability)})"
-    return f"something acts, and these poses do not tell what; the likeliest are {', '.join(likely)}; or {none}"
+    return f"something acts, and these poses do not tell what; the likeliest are {', '.join(names)}; or {none}"
 
 
 def _causes(
@@ -98,8 +109,8 @@ def _causes(
     for finding in findings:
         yield f"{_named(finding)} acts"
     for candidate in candidates:
-        one_pose = ", but less so without some one pose" if Odds().hangs_on_one_pose(candidate.probability) else ""
-        yield f"{candidate.effect} probably acts ({chance(candidate.probability)}{one_pose})"
+        one_pose = ", but less so without some one pose" if candidate.hangs_on_one_pose else ""
+        yield f"{candidate.effect} probably acts, if the catalogue has what acts{one_pose}"
     if found.unexplained.significant:
         yield unexplained(found.unexplained, small)
     if found.outliers:
@@ -109,9 +120,14 @@ def _causes(
 
 def _named(finding: Finding) -> str:
     if not finding.alternatives:
-        return f"{finding.effect} ({chance(finding.probability)})"
+        return likely(finding.effect, finding.probability)
     each = {finding.effect: finding.probability, **finding.alternatives}
-    return "one of " + ", ".join(f"{name} ({chance(p)})" for name, p in each.items())
+    return "one of " + ", ".join(likely(name, p) for name, p in each.items())
+
+
+def likely(name: str, p: float | None) -> str:
+    """A name with its probability, where that is calibrated."""
+    return name if p is None else f"{name} ({chance(p)})"
 
 
 def unexplained(part: Unexplained, small: ErrorUnit) -> str:
@@ -125,9 +141,10 @@ def unexplained(part: Unexplained, small: ErrorUnit) -> str:
 
 def reason(finding: Finding, refusal: Refusal | None) -> str:
     """What a finding rests on, and why it is not corrected, where it is not."""
-    said = f"it acts with probability {chance(finding.probability)}"
+    p = finding.probability
+    said = "it probably acts" if p is None else f"it acts with probability {chance(p)}"
     if finding.alternatives:
-        others = ", ".join(f"{name} {chance(p)}" for name, p in finding.alternatives.items())
+        others = ", ".join(likely(name, p) for name, p in finding.alternatives.items())
         together = chance(finding.together)
         said += f", or else {others}: one of them with {together}"
     if finding.verdict is Verdict.CONFOUNDED and refusal is not None:
@@ -135,11 +152,19 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     return said
 
 
-def errors(before: Residual, after: Residual, held: HoldOut | None, following: NextRecording, small: ErrorUnit) -> str:
-    """The errors before and after, what tells most first, and what to expect of
-    the next recording."""
+def errors(
+    before: Residual,
+    after: Residual,
+    held: HoldOut | None,
+    scopes: Scopes,
+    following: NextRecording,
+    small: ErrorUnit,
+) -> str:
+    """The errors before and after in the same poses, what tells most first, and
+    how uncertain |a| is in which readings."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
-    start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
+    start = small.in_full(following.start_to_start)
+    expanded = ", ".join(f"{name} {small.in_full(value)}" for name, value in scopes.named.items())
     said = []
     if held is not None:
         said.append(f"held-out rms {_pair(small.in_full, held.before_rms_g, held.after_rms_g)}")
@@ -151,7 +176,7 @@ def errors(before: Residual, after: Residual, held: HoldOut | None, following: N
     if before.reduced_chi2 is not None and after.reduced_chi2 is not None:
         said.append(f"χ² per degree of freedom {_pair(_ratio, before.reduced_chi2, after.reduced_chi2)}")
     said.append(f"residual rms {_pair(small.in_full, before.rms_g, after.rms_g)}")
-    said.append(f"expanded uncertainty in the next recording {within} ({start} from start to start, {how})")
+    said.append(f"expanded uncertainty: {expanded} ({start} from start to start, {how})")
     return "; ".join(said)
 
 
@@ -162,3 +187,34 @@ def _pair(text: Callable[[float], str], before: float, after: float) -> str:
 
 def _ratio(value: float) -> str:
     return plain(value, 2)
+
+
+def excluded(loop: Loop, small: ErrorUnit) -> str:
+    """The poses that neither residual has, and by how much they are off; empty
+    where there is none."""
+    pairs = [
+        (b.residual_g, a.residual_g)
+        for b, a in zip(loop.before.poses, loop.after.poses, strict=True)
+        if not a.used and np.isfinite([b.residual_g, a.residual_g]).all()
+    ]
+    if not pairs:
+        return ""
+    before, after = (small.in_full(float(np.abs(v).max())) for v in np.transpose(pairs))
+    return f"; {number_of(len(pairs), 'pose')} excluded from both, off by up to {before} before, {after} after"
+
+
+def contradiction(loop: Loop, scopes: Scopes, small: ErrorUnit) -> str:
+    """What the check recording contradicts; empty where nothing."""
+    held = loop.held_out
+    if held is None:
+        return ""
+    error, floor = held.after_rms_g, held.noise_floor_g
+    # An rms is compared with an expanded uncertainty, which is two standard ones.
+    if np.sqrt(max(error**2 - floor**2, 0.0)) > scopes.another_day:
+        most = small.in_full(scopes.another_day)
+        said = f"{small.in_full(error)} rms there, expanded uncertainty on another day {most}"
+    elif held.worse:
+        said = f"{small.in_full(held.before_rms_g)} rms there with the linear model, {small.in_full(error)} after"
+    else:
+        return ""
+    return f"the check recording contradicts the calibration: {said}"

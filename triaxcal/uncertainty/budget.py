@@ -21,7 +21,7 @@ from triaxcal.uncertainty.budget_statements import (
     TemperatureNotLogged,
     ThermometerNotStated,
 )
-from triaxcal.uncertainty.components import Component, not_held, of_update, reference, rounding, statistical
+from triaxcal.uncertainty.components import Component, not_held, of_update, reference, rounding, statistical, unmodelled
 from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
@@ -89,6 +89,7 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     thermal, excess = temperature(calibration, linearised, stated)
     found = [*statistical(calibration, linearised, excess), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
+    found += unmodelled(calibration)
     found += not_held(calibration, stated)
     found += rounding(calibration, linearised, stated)
     return _budget(calibration, found, level, _not_evaluated(calibration, linearised, stated))

@@ -74,6 +74,11 @@ class AveragedModels(Basis):
 
 
 @dataclass(frozen=True)
+class NoParameter(Basis):
+    """What probably acts on |a| and no parameter describes."""
+
+
+@dataclass(frozen=True)
 class UnmodelledTemperature(Basis):
     """The effects that the model lacks; the temperature moved by ``moved_k``
     from pose to pose. ``identifiable``: the poses can tell what that did.

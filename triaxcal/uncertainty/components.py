@@ -27,6 +27,7 @@ from triaxcal.uncertainty.budget_statements import (
     KeptParameters,
     LongerOrMorePoses,
     ModelsDistinguished,
+    NoParameter,
     NotHeld,
     ReferenceKnown,
     RegisterSteps,
@@ -177,6 +178,15 @@ def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
         return []
     none = np.zeros(len(calibration.parameters))
     return [Component("not_held", "B", np.inf, none, stated.not_held, NotHeld(), HostCorrects())]
+
+
+def unmodelled(calibration: Calibration) -> list[Component]:
+    """What acts on |a| and no parameter describes, rms over the sphere."""
+    part = calibration.unmodelled
+    if part is None or not part.along:
+        return []
+    none = np.zeros(len(calibration.parameters))
+    return [Component("unmodelled", "B", np.inf, none, part.along, NoParameter(), ModelsDistinguished())]
 
 
 def rounding(calibration: Calibration, sphere: SphereMean, stated: Stated) -> list[Component]:

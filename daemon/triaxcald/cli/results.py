@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from triaxcal import text
 from triaxcal.diagnosis import Loop
 from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Calibration, PoseResult, Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.interchange.calibration_document import assumed_in, holds_of
@@ -80,6 +81,8 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
     units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
     of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
     for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
+        if name.startswith(f"{Empirical().name}."):  # dozens, which mean nothing one by one
+            continue
         of = of_effects.get(name, units.get(name.split(".")[0], ""))
         expanded = [f"± {concise_error(whole.expanded[i], of)}"] if whole else []
         rows.append([name, concise(float(value), float(error), of), *expanded])
@@ -88,6 +91,8 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
             value, known, of = c.coefficients_of(effect.name)[name]
             rows.append([f"{effect.name}.{name}", concise(value, known, of), *(["—"] if whole else [])])
     expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
+    if Empirical().name in c.terms:
+        show(f"{Empirical().name}: a smooth function of the direction, whose coefficients are in the document")
     table("coefficients", ["", "value (standard error)", *expanded_at], rows)
     if held := holds_of(c):
         show(f"scale factor, misalignment and bias hold {'; '.join(held)}")
@@ -129,10 +134,15 @@ def text_of_held_out(held: HoldOut, small: ErrorUnit) -> str:
     return f"held out rms {before} before, {after} after, noise floor {floor} ({held.poses} poses)"
 
 
+def chance_of(probability: float | None) -> str:
+    return "likely, not calibrated" if probability is None else diagnosis.chance(probability)
+
+
 def show_loop(loop: Loop, choice: Choice) -> None:
     """Errors, what acts with which probability, and the advice in full."""
     show_before_after(loop, choice.small)
-    likely = [[name, diagnosis.chance(p)] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
+    told = loop.stated
+    likely = [[name, chance_of(told[name])] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", diagnosis.chance(loop.found.nothing)]]
     rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
     table("what acts", ["", "probability"], [*likely, *rest])

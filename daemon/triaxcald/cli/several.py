@@ -17,7 +17,7 @@ from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
 from triaxcal.text.pooled_units import verdict
 from triaxcald.cli.console import show, table
-from triaxcald.cli.results import WORTH_A_LINE
+from triaxcald.cli.results import WORTH_A_LINE, chance_of
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
@@ -177,7 +177,7 @@ def show_agreement(
             [
                 name,
                 tuple(f.effect for f in loop.findings) or "none",
-                tuple(diagnosis.chance(f.probability) for f in loop.findings),
+                tuple(chance_of(f.probability) for f in loop.findings),
                 tuple(", ".join(f.alternatives) for f in loop.findings),
                 small.written(loop.before.residual.rms_g),
                 small.written(loop.after.residual.rms_g),

@@ -85,6 +85,8 @@ class Finding:
     remedy: str | None
     probabilities: Mapping[str, float | None] = field(default_factory=dict)
     """Of its alternatives, by name."""
+    hangs_on_one_pose: bool = False
+    """As a document says that states no probability."""
 
     @property
     def in_question(self) -> bool:
@@ -96,7 +98,7 @@ class Finding:
         """Whether it is likely enough to be known, and is not since some one
         pose may be an outlier."""
         likely = self.probability is not None and Odds().hangs_on_one_pose(self.probability)
-        return self.verdict == CANDIDATE and likely and not self.alternatives
+        return self.verdict == CANDIDATE and (likely or self.hangs_on_one_pose) and not self.alternatives
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -309,6 +311,7 @@ def _findings(value: object, terms: set[str], verdict: str = "") -> Iterator[Fin
             reason=None if reason is None else words(reason),
             remedy=None if remedy is None else words(remedy),
             probabilities=numbers(known.get("probabilities")),
+            hangs_on_one_pose=known.get("hangs_on_one_pose") is True,
         )
 
 

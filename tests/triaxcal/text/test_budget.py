@@ -24,6 +24,10 @@ BASES: list[tuple[of.Basis, str]] = [
         of.NotHeld(),
         "effects that the registers do not have: the other coefficients take their place, as nearly as they can",
     ),
+    (
+        of.NoParameter(),
+        "what acts in some direction and no parameter describes, as probable and as large as the poses leave it",
+    ),
     (of.AveragedModels(()), "the spread over all that may act, each by its probability"),
     (
         of.AveragedModels(("hysteresis",)),

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict
+from tests.triaxcal.evidence.conftest import MINUS
+from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict, diagnose
 from triaxcal.estimate.calibration import Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import ChangePoint, Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
-from triaxcal.poses.pose import PoseStart
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.text import diagnosis
-from triaxcal.uncertainty.next_recording import NextRecording, Source
+from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.next_recording import NextRecording, Source, next_recording
+from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
 NOTHING = Findings((), {}, {}, Unexplained(0.04, UnmodelledKind.TIME, 1e-5, False), None, 0.91)
 KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.", 0.99995)
-GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.", 0.995)
+GROUP = Finding("warm_up", Verdict.CONFOUNDED, None, {"bias_drift": 0.275}, {}, "Let it warm up.", 0.995)
 BEGAN = {4: PoseStart(132.0, None), 9: PoseStart(301.5, None)}
 
 
@@ -44,13 +49,11 @@ def test_the_cause_is_told_with_its_probability() -> None:
         "hysteresis (0.1); or something that no effect describes ("
     )
     assert cause(NOTHING, (KNOWN,)) == "hysteresis (more than 0.999) acts"
-    assert cause(NOTHING, (GROUP,)) == "one of warm_up (0.72), bias_drift (0.28) acts"
-    likely = Candidate("third_order_nonlinearity", 0.63, {})
-    assert cause(NOTHING, (KNOWN,), (likely,)).endswith("third_order_nonlinearity probably acts (0.63)")
-    hangs = Candidate("hysteresis", 0.9995, {})
-    assert (
-        cause(NOTHING, (), (hangs,)) == "hysteresis probably acts (more than 0.999, but less so without some one pose)"
-    )
+    assert cause(NOTHING, (GROUP,)) == "one of warm_up, bias_drift (0.28) acts"
+    likely = Candidate("third_order_nonlinearity", None, {})
+    assert "; third_order_nonlinearity probably acts" in cause(NOTHING, (KNOWN,), (likely,))
+    hangs = Candidate("hysteresis", None, {}, hangs_on_one_pose=True)
+    assert cause(NOTHING, (), (hangs,)).endswith("but less so without some one pose")
 
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
@@ -75,17 +78,18 @@ def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
     assert diagnosis.reason(refused, Refusal.ONE_POSE).endswith(
         "not corrected, because what was found hangs on a single pose"
     )
-    assert "or else bias_drift 0.28: one of them with 0.995" in diagnosis.reason(GROUP, None)
+    assert "or else bias_drift (0.28): one of them with 0.995" in diagnosis.reason(GROUP, None)
 
 
 def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
     assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
     before = Residual(601e-6, 9e-4, 812e-6, 20e-6, 1e-9, 28.1, 902.0)
     after = Residual(18e-6, 4e-5, 24e-6, 2e-5, 0.4, 0.83, 0.97)
-    assert diagnosis.errors(before, after, None, assumed, SMALL) == (
+    assert diagnosis.errors(before, after, None, Scopes(12e-6, 40e-6, 4.1e-3), assumed, SMALL) == (
         "cross-validated rms 812 µg before, 24.0 µg after; residuals in standard errors, rms, 28 before, 0.83 after; "
         "χ² per degree of freedom 902 before, 0.97 after; residual rms 601 µg before, 18.0 µg after; "
-        "expanded uncertainty in the next recording 4100 µg (2000 µg from start to start, assumed)"
+        "expanded uncertainty: this fit 12.0 µg, this session's poses 40.0 µg, another day 4100 µg "
+        "(2000 µg from start to start, assumed)"
     )
     held = HoldOut(131e-6, 16.2e-6, 15e-6, 9)
     said = diagnosis.errors(before, after, held, assumed, SMALL)
@@ -112,3 +116,30 @@ def test_every_refusal_has_words(refused: Refusal) -> None:
 @pytest.mark.parametrize("found", Recommendation)
 def test_every_call_has_words(found: Recommendation) -> None:
     assert diagnosis.call(found)
+
+
+def test_what_a_check_recording_contradicts_comes_first(
+    poses_with: Callable[..., list[Pose]], with_effects: Callable[..., Sensor]
+) -> None:
+    poses, same = poses_with(1), poses_with(2)
+    other = [replace(p, mean=p.mean + with_effects().scale_factor * 2e-2) for p in same]
+    for check, contradicted in ((same, False), (other, True)):
+        loop = diagnose(poses, signs=MINUS, check=check, catalogue=())
+        assert diagnosis.lines(loop, SMALL)[0].startswith("the check recording contradicts") is contradicted
+
+
+def test_poses_that_are_excluded_are_told_beside_the_residuals(
+    poses_with: Callable[..., list[Pose]], knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    loop = diagnose(knocked(poses_with(4), 9, 1e-3), signs=MINUS, catalogue=())
+    assert list(loop.found.outliers) == [9]
+    assert "; 1 pose excluded from both, off by up to 9" in diagnosis.lines(loop, SMALL)[2]
+    assert not diagnosis.excluded(diagnose(poses_with(4), signs=MINUS, catalogue=()), SMALL)
+
+
+def test_each_uncertainty_is_of_more_than_the_one_before(poses_with: Callable[..., list[Pose]]) -> None:
+    c = diagnose(poses_with(4), signs=MINUS, catalogue=()).after
+    found = budget(c)
+    told = list(Scopes.of(c, found, next_recording(c, found)).named.values())
+    assert told[0] == float(found.magnitude.expanded)
+    assert told == sorted(told)
