@@ -47,6 +47,7 @@ SPEED = {"tcp": 20.0, "can": 8.0, "rtu": 20.0}
 DEADLINE_S = 5.0
 HUNG_S = 30.0
 PROGRESS = ("unit: ", "warning: ", "advice: ")
+PATIENCE = "triaxcal: putting things in order"
 GAPS_S = (0.0, 0.003, 0.05, 0.5)
 """Scales of the time from one signal to the next."""
 START_S = 1.0
@@ -326,7 +327,8 @@ def judge(ended: Ended, out: str, folder: Path, held: str | None) -> list[str]:
         return [] if ended.code in ENDED_EARLY | {0} else [f"exit code {ended.code} before the first line"]
     lines = [line for line in ended.err.splitlines() if not line.startswith(PROGRESS)]
     faults = [f"said: {line}" for line in lines if not line.startswith(("triaxcal: ", "serving ", f"{folder}/"))]
-    last = lines[-1] if lines else ""
+    # A signal may come when the unit has ended and the bus is being closed.
+    last = next((line for line in reversed(lines) if not line.startswith(PATIENCE)), "")
     faults += _judge_code(ended, last, held)
     faults += _judge_files(folder, ended.code, last)
     if ended.shot.command in ("run", "provision") and ended.code in (0, 1) and not out.endswith("}\n"):
