@@ -12,6 +12,7 @@ from triaxcal.estimate.calibration import Unmodelled
 from triaxcal.model.sensor import Sensor
 
 NOTHING = Unmodelled(0.0, 0.0)
+"""Where nothing acts beside the covariance."""
 
 
 def uncertainty_of_readings(

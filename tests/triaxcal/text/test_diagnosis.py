@@ -23,6 +23,7 @@ from triaxcal.uncertainty.scopes import Scopes
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
+SCOPES = Scopes(12e-6, 40e-6, 4.1e-3)
 NOTHING = Findings((), {}, {}, Unexplained(0.04, UnmodelledKind.TIME, 1e-5, False), None, 0.91)
 KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.", 0.99995)
 GROUP = Finding("warm_up", Verdict.CONFOUNDED, None, {"bias_drift": 0.275}, {}, "Let it warm up.", 0.995)
@@ -85,20 +86,21 @@ def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
     assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
     before = Residual(601e-6, 9e-4, 812e-6, 20e-6, 1e-9, 28.1, 902.0)
     after = Residual(18e-6, 4e-5, 24e-6, 2e-5, 0.4, 0.83, 0.97)
-    assert diagnosis.errors(before, after, None, Scopes(12e-6, 40e-6, 4.1e-3), assumed, SMALL) == (
+    assert diagnosis.errors(before, after, None, SCOPES, assumed, SMALL) == (
         "cross-validated rms 812 µg before, 24.0 µg after; residuals in standard errors, rms, 28 before, 0.83 after; "
         "χ² per degree of freedom 902 before, 0.97 after; residual rms 601 µg before, 18.0 µg after; "
         "expanded uncertainty: this fit 12.0 µg, this session's poses 40.0 µg, another day 4100 µg "
         "(2000 µg from start to start, assumed)"
     )
     held = HoldOut(131e-6, 16.2e-6, 15e-6, 9)
-    said = diagnosis.errors(before, after, held, assumed, SMALL)
+    said = diagnosis.errors(before, after, held, SCOPES, assumed, SMALL)
     assert said.startswith("held-out rms 131 µg before, 16.2 µg after; ")
 
 
 def test_an_error_that_nothing_corrects_is_told_once() -> None:
     one = Residual(601e-6, 9e-4, None, 20e-6, None)
-    said = diagnosis.errors(one, one, None, NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED), SMALL)
+    assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
+    said = diagnosis.errors(one, one, None, SCOPES, assumed, SMALL)
     assert said.startswith("residual rms 601 µg; expanded")
 
 
