@@ -45,7 +45,7 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcal.text.advice import advice
+from triaxcal.text.advice import notes
 from triaxcal.units import ErrorUnit
 
 # The names that others script against (the contract of the command line).
@@ -589,7 +589,7 @@ class Failing(Radiation):
     ((name, why),) = loop.faulty.items()
     assert name == "radiation"
     assert reason in why
-    said = list(advice(loop, ErrorUnit.of("g", 1.0)))
+    said = list(notes(loop, ErrorUnit.of("g", 1.0)))
     assert f"the effect radiation of the package dosimetry-effects cannot be used: {why}" in said
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
