@@ -190,13 +190,10 @@ def poses_apart(rows: Sequence[Document], apart_deg: float) -> int:
 
 
 def verification_document(
-    before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str, apart: Apart | None
+    before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str, apart: Apart
 ) -> Document:
     """``before``: the device's output with its old registers; ``after``: with
     the new ones, after a restart.
-
-    Without ``apart`` the document is as before there were outcomes: it says
-    nothing of attitudes, and has no uncertainty.
     """
     rms = after.rms_g
     document: Document = {
@@ -211,10 +208,9 @@ def verification_document(
         "poses": pose_rows(after),
         "data_quality": list(after.data_quality),
     }
-    if apart is not None:
-        angles = apart.angles_deg(after.poses)
-        for row, angle in zip(document["poses"], angles, strict=True):
-            row["from_fit_deg"] = degrees(float(angle))
-        document["expanded_uncertainty_g"] = uncertainty(after.expanded_uncertainty_g)
-        document["poses_apart"] = poses_apart(document["poses"], apart.apart_deg)
+    angles = apart.angles_deg(after.poses)
+    for row, angle in zip(document["poses"], angles, strict=True):
+        row["from_fit_deg"] = degrees(float(angle))
+    document["expanded_uncertainty_g"] = uncertainty(after.expanded_uncertainty_g)
+    document["poses_apart"] = poses_apart(document["poses"], apart.apart_deg)
     return document

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,13 @@ from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.audit.drawings import same_report
 from triaxcald.audit.figures import Agreement
-from triaxcald.audit.older import as_searched, turned_back
 from triaxcald.audit.results import (
     CANNOT,
     DRAWN_WITH,
     Again,
     Digests,
     as_stored,
+    by_its_own_words,
     compute,
     digests,
     exit_codes_in,
@@ -63,12 +63,8 @@ class Notes:
     name, then and now; ``not_beside`` are files that are not beside the
     recording; ``report_as_listed`` where the report was not drawn again."""
 
-    older: bool = False
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     report_as_listed: bool = False
-    earlier: bool = False
-    """What its search found was taken as it is. Sentences and keys of later
-    versions were not compared."""
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
@@ -83,8 +79,10 @@ class Audit:
 
     ``computed_on`` is the computer then and now, by what is known of it.
     ``checked`` are the attachments that were computed again or compared with
-    the register traffic. ``verdict`` is the outcome's, None in a recording from
-    before there were outcomes.
+    the register traffic. ``verdict`` is the outcome's, None where it has none.
+    ``made_by`` is the version of triaxcal that made the recording, None where
+    it is this one; of another version's documents neither the sentences are
+    compared nor the keys that they lack.
     """
 
     recording: str
@@ -94,6 +92,7 @@ class Audit:
     verdict: str | None = None
     agreement: Agreement = field(default_factory=Agreement)
     computed_on: tuple[Mapping[str, str], Mapping[str, str]] = field(default_factory=lambda: ({}, {}))
+    made_by: str | None = None
 
     @property
     def result(self) -> Result:
@@ -109,16 +108,17 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
         raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
     with Recording.open(path) as recording:
         require_of_unit(recording)
-        if recording.ends_with not in ("", FORMAT):
+        if not recording.ends_with:
+            raise RecordingError(
+                f"{path}: holds no result to audit; `record` made it, or a development version before 0.2"
+            )
+        if recording.ends_with != FORMAT:
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
         return _Audit(path, recording, compute).run()
 
 
 COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
 """Documents whose figures are computed again."""
-EARLIER = frozenset({"0.1.0"})
-"""Versions that named effects by a search, and whose documents have other
-sentences and lack keys that are made now."""
 
 
 class _Audit:
@@ -135,16 +135,12 @@ class _Audit:
 
     def run(self) -> Audit:
         found = survey(self._recording, ATTACHMENT)
-        back = turned_back(self._recording, self._raw) if not self._recording.ends_with else []
-        if not back and not {CERTIFICATE, ATTACHMENT} & set(self._held) and (self._older or self._mended):
-            missing = CERTIFICATE if self._older else ATTACHMENT
-            raise RecordingError(f"{self._path}: attachment {missing}: missing; the recording holds no result to audit")
-        self._differences += back
+        if self._mended and not {CERTIFICATE, ATTACHMENT} & set(self._held):
+            raise RecordingError(
+                f"{self._path}: attachment {ATTACHMENT}: missing; the recording holds no result to audit"
+            )
         again = self._again()
-        if self._ends_with_outcome or ATTACHMENT in self._held:
-            self._check_outcome(found, again)
-        elif CERTIFICATE not in self._held:
-            self._add(CERTIFICATE, Kind.MISSING)
+        self._check_outcome(found, again)
         if again is not None:
             self._check_results(again)
             self._differences += previews.check(self._recording, again.previews)
@@ -163,21 +159,14 @@ class _Audit:
             verdict if isinstance(verdict, str) else None,
             self._agreement,
             self._computed_on(),
+            self._made_by,
         )
 
     @property
-    def _ends_with_outcome(self) -> bool:
-        return self._recording.ends_with == FORMAT
-
-    @property
-    def _older(self) -> bool:
-        return not self._ends_with_outcome
-
-    @property
-    def _earlier(self) -> bool:
-        """Whether a version made it whose findings, sentences and keys are not
-        those of this one."""
-        return self._recording.metadata.get("software", {}).get("triaxcal") in EARLIER
+    def _made_by(self) -> str | None:
+        """The version that made it, where that is another one."""
+        made_by = self._recording.metadata.get("software", {}).get("triaxcal", "an unknown version")
+        return None if made_by == software()["triaxcal"] else made_by
 
     @property
     def _aborted(self) -> bool:
@@ -189,13 +178,9 @@ class _Audit:
     def _again(self) -> Again | None:
         try:
             again = self._compute(self._recording, self._raw)
-            stored = _object(self._held.get(CERTIFICATE, b"")) if self._earlier else None
-            if stored is not None and again.certified is not None:
-                again = replace(
-                    again, certified=as_searched(again.certified, stored, again.bundle.profile, again.station.limits)
-                )
             again, self._agreement = as_stored(again, {name: _object(self._held.get(name, b"")) for name in COMPUTED})
-            return again
+            stored = _object(self._held.get(CERTIFICATE, b"")) if self._made_by else None
+            return again if stored is None else by_its_own_words(again, stored)
         except CANNOT as e:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
             return None
@@ -240,8 +225,10 @@ class _Audit:
         document = outcome_again(held, again, self._recording, self._papers(again), contents_again or {})
         # The inventory is compared part by part.
         again_data = to_text(document).encode()
-        told = compare(ATTACHMENT, _without_contents(data), _without_contents(again_data), earlier=self._earlier)
-        if not told and not self._earlier and contents_again == held.get("contents") and data != again_data:
+        told = compare(
+            ATTACHMENT, _without_contents(data), _without_contents(again_data), by_another=bool(self._made_by)
+        )
+        if not told and self._made_by is None and contents_again == held.get("contents") and data != again_data:
             told = [Difference(ATTACHMENT, Kind.BYTES)]
         self._differences += told
 
@@ -252,8 +239,9 @@ class _Audit:
         ending = None if self._aborted else again.ending()
         if ending is not None and again.certified is not None:
             if ending.verdict is not Verdict.FAIL:
-                same = None if self._earlier else to_text(again.certified.document).encode()
-                found[CERTIFICATE] = digest_of(self._held.get(CERTIFICATE, b"") if same is None else same)
+                same = self._made_by is None or CERTIFICATE not in self._held
+                document = to_text(again.certified.document).encode() if same else self._held[CERTIFICATE]
+                found[CERTIFICATE] = digest_of(document)
             if REPORT in self._held:
                 found[REPORT] = digest_of(self._held[REPORT])
         return found
@@ -265,10 +253,9 @@ class _Audit:
         if again.certified is None and not self._aborted:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=again.why_not)
         elif again.certified is not None and ending is not None:
-            has_one = self._older or ending.verdict is not Verdict.FAIL
+            has_one = ending.verdict is not Verdict.FAIL
             self._result(CERTIFICATE, to_text(again.certified.document) if has_one else None)
-            if not self._older:
-                self._check_report(again)
+            self._check_report(again)
         elif self._aborted:
             for name in (CERTIFICATE, REPORT):
                 self._result(name, None)
@@ -293,7 +280,7 @@ class _Audit:
         if stored is None:
             self._add(name, Kind.MISSING)
         else:
-            self._differences += compare(name, stored, again.encode(), earlier=self._earlier)
+            self._differences += compare(name, stored, again.encode(), by_another=bool(self._made_by))
 
     def _check_report(self, again: Again) -> None:
         stored, ending = self._held.get(REPORT), again.ending()
@@ -392,7 +379,7 @@ class _Audit:
     def _versions(self) -> dict[str, tuple[str, str]]:
         now = {name: v for name, v in {**software(), **drawn_with()}.items() if name not in KEYS}
         then = self._recording.metadata.get("software", {})
-        drawn = {name: then.get(name, "unknown") for name in DRAWN_WITH} if not self._older else {}
+        drawn = {name: then.get(name, "unknown") for name in DRAWN_WITH}
         return {n: (v, now[n]) for n, v in {**then, **drawn}.items() if n in now and v != now[n]}
 
     def _computed_on(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
@@ -401,10 +388,8 @@ class _Audit:
 
     def _notes(self, not_beside: tuple[str, ...]) -> Notes:
         return Notes(
-            older=self._older,
             versions=self._versions(),
             report_as_listed=self._listed_report,
-            earlier=self._earlier,
             losses=tuple(losses_of(self._recording)),
             mended=self._mended,
             not_beside=not_beside,

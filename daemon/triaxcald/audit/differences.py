@@ -56,8 +56,6 @@ class Kind(Enum):
     NOT_LAST = auto()
     NO_END = auto()
     """The recording says that it ends with it."""
-    TURNED_BACK = auto()
-    """It was made to end with ``stored``, and does not say so any more."""
     TWICE = auto()
     TIMES = auto()
     SEQUENCE = auto()
@@ -96,18 +94,18 @@ class Difference:
     again: Any = NOTHING
 
 
-def compare(part: str, stored: bytes, again: bytes, *, earlier: bool = False) -> list[Difference]:
-    """Two JSON documents, of which the second was computed again. ``earlier``:
-    the first is of a version with other sentences and fewer keys; these are not
-    compared, nor the bytes."""
+def compare(part: str, stored: bytes, again: bytes, *, by_another: bool = False) -> list[Difference]:
+    """Two JSON documents, of which the second was computed again. ``by_another``:
+    another version made the first; then sentences, keys that the first lacks
+    and bytes are not compared."""
     if stored == again:
         return []
     try:
         before = json.loads(stored)
     except (ValueError, RecursionError):
         return [Difference(part, Kind.NO_DOCUMENT)]
-    found = list(differing(part, before, json.loads(again), earlier=earlier))
-    if earlier and not found:
+    found = list(differing(part, before, json.loads(again), by_another=by_another))
+    if by_another and not found:
         return []
     if not found:
         return [Difference(part, Kind.BYTES)]
@@ -115,16 +113,16 @@ def compare(part: str, stored: bytes, again: bytes, *, earlier: bool = False) ->
     return found[:MOST] + rest
 
 
-def differing(part: str, stored: Any, again: Any, at: str = "", *, earlier: bool = False) -> Iterator[Difference]:
-    """Where two JSON values differ; ``earlier`` as in `compare`."""
+def differing(part: str, stored: Any, again: Any, at: str = "", *, by_another: bool = False) -> Iterator[Difference]:
+    """Where two JSON values differ; ``by_another`` as in `compare`."""
     if isinstance(stored, Mapping) and isinstance(again, Mapping):
         for key in dict.fromkeys([*stored, *again]):
-            if earlier and (key in SENTENCES or key not in stored):
+            if by_another and (key in SENTENCES or key not in stored):
                 continue
             inner = f"{at}.{key}" if at else str(key)
-            yield from differing(part, stored.get(key, NOTHING), again.get(key, NOTHING), inner, earlier=earlier)
+            yield from differing(part, stored.get(key, NOTHING), again.get(key, NOTHING), inner, by_another=by_another)
     elif isinstance(stored, list) and isinstance(again, list) and len(stored) == len(again):
         for i, (s, t) in enumerate(zip(stored, again, strict=True)):
-            yield from differing(part, s, t, f"{at}[{i}]", earlier=earlier)
+            yield from differing(part, s, t, f"{at}[{i}]", by_another=by_another)
     elif type(stored) is not type(again) or stored != again:
         yield Difference(part, Kind.VALUE, at, stored, again)

@@ -22,6 +22,7 @@ from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import ATTACHMENT, Code, Ending, Papers, Verdict, measured_in, outcome_document
 from triaxcald.pipeline import DecodedStream, Pipeline
+from triaxcald.provision.image import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
@@ -129,7 +130,7 @@ def compute(recording: Recording, raw: Digests) -> Again:
             verified(check[CORRECTED], station.reference),
             limit_g=station.limits.verification_rms_g,
             raw_sha256=raw.verification.hexdigest(),
-            apart=_apart(recording, tumble[READINGS], station) if recording.ends_with else None,
+            apart=_apart(recording, tumble[READINGS], station),
         )
     return Again(bundle, station, tumble[READINGS], certified, why_not, verification, previews.thinned())
 
@@ -222,6 +223,20 @@ def _certified_as_stored(
     outside = over_limits(document["result"]["after"], again.station.limits)
     document |= {"outside": outside, "verdict": verdict_of(outside, again.station.limits)}
     return replace(certified, document=document, within_limits=not outside)
+
+
+def by_its_own_words(again: Again, stored: Mapping[str, Any]) -> Again:
+    """With the register words of the ``stored`` certificate of another version,
+    in place of those that this one computes: the register traffic is judged by
+    what that version asked for. Raises LookupError, TypeError or ValueError
+    where the certificate lacks a part, and DriverError for words that the
+    profile does not have."""
+    certified, registers = again.certified, stored["registers"]
+    if certified is None or certified.image is None or registers is None:
+        return again
+    profile = again.bundle.profile
+    words = {w["register"]: profile.encode(w["register"], w["wanted"]) for w in registers["words"]}
+    return replace(again, certified=replace(certified, image=image_of(profile, words)))
 
 
 DRAWN_WITH = ("matplotlib", "jinja2")

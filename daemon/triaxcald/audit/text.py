@@ -14,7 +14,6 @@ from triaxcald.audit.figures import Agreement
 from triaxcald.audit.many import Audited
 
 _LONGEST = 60
-_AGREES = "agrees, as far as this version can tell"
 
 
 def difference(of: Difference) -> str:
@@ -50,8 +49,6 @@ def _what(of: Difference) -> str:
             return f"not the last attachment; that is {_bare(of.again)}"
         case Kind.NO_END:
             return "missing, though the recording says that it ends with it"
-        case Kind.TURNED_BACK:
-            return f"the recording was made to end with {of.stored}, and was turned back into the format before it"
         case Kind.TWICE:
             return "is in the recording more than once"
         case Kind.TIMES:
@@ -100,18 +97,9 @@ def _short(value: object) -> str:
 
 
 def notes(of: Notes) -> list[str]:
-    found = []
-    if of.older:
-        found.append(
-            "recorded before there were outcomes, and audited by the rules of that format: nothing in it vouches for "
-            "the report, and no one word says how the run ended"
-        )
-    found += [f"{name}: {then} then, {now} now" for name, (then, now) in of.versions.items()]
-    if of.earlier:
-        found.append(
-            "an earlier version made it, which named effects by a search that is gone: what that found is taken as the "
-            "certificate has it; raw records, poses, registers and verification are compared, sentences are not"
-        )
+    found = [f"{name}: {then} then, {now} now" for name, (then, now) in of.versions.items()]
+    if "triaxcal" in of.versions:
+        found.append("sentences, and keys that the earlier version did not write, are not compared")
     if of.report_as_listed:
         found.append("report.html was not drawn again, since versions differ; it is compared with the outcome's digest")
     found += of.losses
@@ -132,12 +120,11 @@ def heading(of: Audit) -> str:
 def _result(of: Audit) -> str:
     match of.result:
         case Result.DIFFERS:
-            return "differs"
+            return f"differs from what triaxcal {of.made_by} computed" if of.made_by else "differs"
         case Result.SAME_FIGURES:
-            same = _AGREES if of.notes.earlier else "the same figures"
-            return f"{same} (largest difference {_largest(of.agreement)}; {_where(of)})"
+            return f"the same figures (largest difference {_largest(of.agreement)}; {_where(of)})"
         case Result.SAME_BYTES:
-            return _AGREES if of.notes.earlier else "the same, byte for byte"
+            return f"the same as triaxcal {of.made_by} computed" if of.made_by else "the same, byte for byte"
 
 
 def _largest(of: Agreement) -> str:

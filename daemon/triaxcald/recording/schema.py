@@ -271,12 +271,7 @@ class RawDigest:
         self.records += len(batch)
 
     def hexdigest(self) -> str:
-        return self.were_it(self.ends_with)
-
-    def were_it(self, ends_with: str) -> str:
-        """The digest of the same records in a recording that says it ends with
-        ``ends_with``."""
-        whole = hashlib.sha256(ends_with.encode())
+        whole = hashlib.sha256(self.ends_with.encode())
         for phase in sorted(self._phases):
             columns, payloads = self._phases[phase]
             whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())

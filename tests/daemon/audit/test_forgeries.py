@@ -16,8 +16,9 @@ from mcap.records import Channel, Message, Metadata
 from mcap.writer import IndexType
 
 from tests.daemon.audit.forging import END, OUTCOME, Forgery, at
+from triaxcald.audit import audit
+from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
-from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import EVENTS, LOSS, RAW, REGISTERS
 
 CERTIFICATE, VERIFICATION, REPORT = "certificate.json", "verification.json", "report.html"
@@ -182,13 +183,6 @@ def _turned_back(f: Forgery) -> None:
     f.metadata("recording").metadata.pop("ends_with")
 
 
-def _turned_back_with_digest(source: Path, f: Forgery) -> None:
-    _turned_back(f)
-    with Recording.open(source) as recording:
-        digest = recording.raw_digest().were_it("")
-    f.metadata("raw").metadata["sha256"] = digest
-
-
 def _bare(f: Forgery) -> None:
     _turned_back(f)
     f.drop(CERTIFICATE, REPORT, VERIFICATION, BEFORE, AFTER)
@@ -276,12 +270,6 @@ ROWS = [
     Row("overruled doubts hidden", _outcome(forced="because"), f"{END}: sha256: stored "),
     Row("another time of the end", _outcome(ended="2020-01-01T00:00:00.000+00:00"), f"{END}: sha256: stored "),
     Row("end record taken out", lambda f: f.drop(END), f"{END}: {MISSING}"),
-    Row(
-        "no outcome listed at the head",
-        _turned_back,
-        "recording: the recording was made to end with triaxcal.outcome/1",
-    ),
-    Row("nothing but raw records left", _bare, "recording: the recording was made to end with triaxcal.outcome/1"),
     Row("no statistics", lambda f: None, "statistics: the index at the end", writing={"use_statistics": False}),
     Row("no indices", lambda f: None, "chunks: the index at the end", writing={"index_types": IndexType.NONE}),
     Row("hidden in the index", lambda f: None, "attachments: the index at the end", writing={"spoil": _unindexed}),
@@ -418,15 +406,12 @@ def test_the_table_is_of_forgeries_and_not_of_the_forger(
     assert said(copy.write(tmp_path / "sealed.mcap")) == []
 
 
-def test_a_recording_turned_back_is_told_as_such_with_its_digests_mended(
-    finished_run: Any, source: Forgery, tmp_path: Path, said: Callable[[Path], list[str]]
-) -> None:
-    """The certificate's own digest is of what the recording ends with."""
+@pytest.mark.parametrize("make", [_turned_back, _bare])
+def test_a_recording_without_its_end_is_not_audited(source: Forgery, tmp_path: Path, make: Make) -> None:
     forged = source.copied()
-    _turned_back_with_digest(finished_run.can, forged)
-    found = said(forged.write(tmp_path / "forged.mcap"))
-    assert any("was turned back into the format before it" in line for line in found), found
-    assert any(line.startswith(f"{CERTIFICATE}: recording.raw_sha256: stored ") for line in found), found
+    make(forged)
+    with pytest.raises(RecordingError, match="holds no result to audit"):
+        audit(forged.write(tmp_path / "forged.mcap"))
 
 
 @pytest.mark.parametrize("name", [CERTIFICATE, REPORT, OUTCOME])
@@ -441,32 +426,6 @@ def test_an_edited_file_beside_a_recording_is_found_and_a_missing_one_is_noted(
     assert (found.differences, found.notes.not_beside) == ((), (f"unit.{name}",))
     path.with_suffix(f".{name}").write_bytes(finished_run.can.with_suffix(f".{name}").read_bytes() + b"\n")
     assert auditor.lines(path) == [f"unit.{name}: the file beside the recording is not the one in it"]
-
-
-GOLDEN = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
-OLDER: list[tuple[str, Make, str]] = [
-    ("verification taken out", lambda f: f.drop(VERIFICATION), f"{VERIFICATION}: {MISSING}"),
-    ("traffic taken out", lambda f: f.each(REGISTERS, lambda m: None), f"{BEFORE}: scale_factor_x: "),
-    ("registers before zeroed", _zeroed, f"{BEFORE}: scale_factor_x: 00000000 here, "),
-    ("registers after taken out", lambda f: f.drop(AFTER), f"{AFTER}: {MISSING}"),
-    ("raw digest zeroed", lambda f: f.metadata("raw").metadata.update(sha256="0" * 64), "raw: sha256: stored "),
-    ("raw log times shifted", lambda f: f.each(RAW, at(SECOND_NS)), f"{RAW}: "),
-    ("an event taken out", _without_event("provisioned"), f"{EVENTS}: provisioned: missing"),
-    ("an attachment twice", _twice(lambda f: f.attachment(REPORT)), f"{REPORT}: is in the recording more than once"),
-]  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "make", "says"), OLDER, ids=[name for name, _, _ in OLDER])
-def test_in_a_recording_from_before_there_were_outcomes_too(
-    tmp_path: Path, auditor: Any, name: str, make: Make, says: str
-) -> None:
-    forged = Forgery.of(GOLDEN)
-    make(forged)
-    path = forged.write(tmp_path / "forged.mcap")
-    found = auditor.lines(path)
-    assert any(line.startswith(says) for line in found), found
-    assert auditor(path).notes.older
 
 
 def test_a_file_beside_an_aborted_unit_s_recording_that_says_it_was_certified_is_found(
