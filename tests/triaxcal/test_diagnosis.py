@@ -62,8 +62,10 @@ def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -
         assert candidate.effect == "second_order_nonlinearity"
         # Where no pose is expected to tell more, there is none to record.
         assert loop.call is (Recommendation.RECORD_MORE if loop.advice.actions else Recommendation.USABLE)
-        assert loop.advice.expected["second_order_nonlinearity"].if_it_acts > candidate.probability
-        assert 0.5 <= candidate.probability < 0.99
+        probability = loop.probabilities[candidate.effect]
+        assert loop.advice.expected["second_order_nonlinearity"].if_it_acts > probability
+        assert 0.5 <= probability < 0.99
+        assert candidate.probability is None  # such probabilities are not calibrated
         value, error, _ = candidate.coefficients["x"]
         assert error is not None
         assert abs(value - 3e-4) < 4 * error

@@ -167,7 +167,8 @@ def test_creep_that_nothing_explains_makes_no_effect_and_widens_the_errors_where
             replace(p, mean=p.mean + where * creep, creep=creep, covariance=p.covariance + np.outer(creep, creep) / 12)
         )
     loop = diagnose(with_slopes(settled, 0) if slopes else settled, signs=MINUS)
-    assert loop.findings == loop.candidates == ()
+    assert loop.findings == ()
+    assert all(c.probability is None for c in loop.candidates)
     # As an error of each pose creep is accounted for; poses that know their slopes show that something moves.
     assert (loop.found.nothing < 0.5) is (along and slopes)
     wider = loop.after.standard_errors[:9] / fit(poses, signs=MINUS).standard_errors
