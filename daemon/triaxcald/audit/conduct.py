@@ -14,7 +14,7 @@ from triaxcald.audit import contents, previews
 from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.audit.drawings import same_report
-from triaxcald.audit.figures import Agreement
+from triaxcald.audit.figures import Agreement, furthest
 from triaxcald.audit.results import (
     CANNOT,
     DRAWN_WITH,
@@ -93,6 +93,9 @@ class Audit:
     agreement: Agreement = field(default_factory=Agreement)
     computed_on: tuple[Mapping[str, str], Mapping[str, str]] = field(default_factory=lambda: ({}, {}))
     made_by: str | None = None
+    furthest: tuple[float, str] | None = None
+    """Of another version's calibration: the largest difference of a coefficient
+    in its standard error, and which."""
 
     @property
     def result(self) -> Result:
@@ -132,6 +135,7 @@ class _Audit:
         self._mended = RECOVERY_RECORD in recording.metadata
         self._listed_report = False
         self._agreement = Agreement()
+        self._furthest: tuple[float, str] | None = None
 
     def run(self) -> Audit:
         found = survey(self._recording, ATTACHMENT)
@@ -160,6 +164,7 @@ class _Audit:
             self._agreement,
             self._computed_on(),
             self._made_by,
+            self._furthest,
         )
 
     @property
@@ -180,7 +185,12 @@ class _Audit:
             again = self._compute(self._recording, self._raw)
             again, self._agreement = as_stored(again, {name: _object(self._held.get(name, b"")) for name in COMPUTED})
             stored = _object(self._held.get(CERTIFICATE, b"")) if self._made_by else None
-            return again if stored is None else by_its_own_words(again, stored)
+            if stored is None:
+                return again
+            if again.certified is not None:
+                both = (document["result"]["calibration"] for document in (stored, again.certified.document))
+                self._furthest = furthest(*both)
+            return by_its_own_words(again, stored)
         except CANNOT as e:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
             return None

@@ -14,7 +14,7 @@ MOST = 8
 
 SENTENCES = frozenset({
     "advice", "apart", "data_quality", "halved_by", "holds", "how", "lead", "not_evaluated", "reason", "remedy",
-    "warnings",
+    "summary", "warnings",
 })  # fmt: skip
 """Keys of documents under which English stands: words may be better in another
 version, numbers may not differ."""

@@ -27,7 +27,6 @@ apart makes 1e-8."""
 WORDED = 5e-5
 """Of itself: so far a figure may be from the edge between two wordings."""
 _OF_ONE_POSE = ("residual_g", "before_residual_g", "error_g")
-_WORDED = SENTENCES | {"summary"}
 _NUMERAL = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
@@ -86,7 +85,7 @@ class Figures:
             if same_figure(stored, again, uncertainty):
                 agreement.take(f"{part}: {at}", abs(stored - again), again, uncertainty)
                 return stored
-        worded = key in _WORDED and isinstance(again, str) and isinstance(stored, str) and stored != again
+        worded = key in SENTENCES and isinstance(again, str) and isinstance(stored, str) and stored != again
         if worded and self.same_words(stored, again):
             agreement.figures += 1
             return stored
@@ -117,6 +116,22 @@ class Figures:
         digits = _mantissa(between)
         at = bisect_left(self.digits, digits)
         return any(abs(near - digits) <= WORDED * digits for near in self.digits[max(0, at - 1) : at + 1])
+
+
+def furthest(stored: Any, again: Any) -> tuple[float, str] | None:
+    """Of two calibrations by different versions: the largest difference between
+    two coefficients, as a share of the standard error of the one computed
+    ``again``, and its place; None where they have none in common."""
+    values, errors = dict(_placed(stored)), dict(_stated({"standard_error": again.get("standard_error", {})}))
+    for name, coefficients in again.get("effects", {}).items():
+        errors |= _stated(coefficients, inside("effects", name))
+    now = dict(_placed(again))
+    shares = [
+        (abs(values[at] - now[at]) / error, at)
+        for at, error in errors.items()
+        if error and isinstance(values.get(at), float) and isinstance(now.get(at), float)
+    ]
+    return max(shares, default=None)
 
 
 def same_figure(stored: float, again: Printed, uncertainty: float | None) -> bool:

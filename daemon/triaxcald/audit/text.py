@@ -10,7 +10,7 @@ from typing import Any
 
 from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
-from triaxcald.audit.figures import Agreement
+from triaxcald.audit.figures import SHARE, Agreement
 from triaxcald.audit.many import Audited
 
 _LONGEST = 60
@@ -120,11 +120,19 @@ def heading(of: Audit) -> str:
 def _result(of: Audit) -> str:
     match of.result:
         case Result.DIFFERS:
-            return f"differs from what triaxcal {of.made_by} computed" if of.made_by else "differs"
+            return f"differs from what triaxcal {of.made_by} computed{_furthest(of)}" if of.made_by else "differs"
         case Result.SAME_FIGURES:
             return f"the same figures (largest difference {_largest(of.agreement)}; {_where(of)})"
         case Result.SAME_BYTES:
             return f"the same as triaxcal {of.made_by} computed" if of.made_by else "the same, byte for byte"
+
+
+def _furthest(of: Audit) -> str:
+    if of.furthest is None:
+        return ""
+    share, place = of.furthest
+    where = f" ({place})" if share > SHARE else ""
+    return f", coefficients by at most {_rounded_up(max(share, SHARE))} of their standard errors{where}"
 
 
 def _largest(of: Agreement) -> str:
