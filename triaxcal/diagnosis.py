@@ -224,8 +224,11 @@ def diagnose(
     effects = considered(poses, catalogue)
     faulty = faults_of(posterior.evidence.rows, effects)
     hidden = not_identifiable(posterior.evidence, [e for e in effects if e.name not in faulty])
-    before, after = (c.with_blind_to(tuple(hidden)) for c in (before, corrected(before, posterior, moment)))
     found, refused = findings(posterior), refusal(posterior)
+    after = corrected(before, posterior, moment, any_certain=bool(found.named))
+    before, after = (c.with_blind_to(tuple(hidden)) for c in (before, after))
+    if refused is None and found.candidates and not after.sensor.effects:
+        refused = Refusal.GAIN
     report = _Report(posterior, moment, after, found)
     sound_check = None if check is None else [p for p in check if not p.fault]
     return Loop(

@@ -22,12 +22,12 @@ from triaxcal.uncertainty.extrapolation import extrapolated
 from triaxcal.uncertainty.propagation import gain_given_prior
 
 
-def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibration:
+def corrected(before: Calibration, posterior: Posterior, at: HoldsAt, *, any_certain: bool) -> Calibration:
     """With the likely effects at their mean coefficients. ``before`` is the
     linear calibration of all poses that were given: where no effect is to be
     corrected (`least_loss`), it stays, with the errors that all likely sets make
     of it."""
-    model_average = least_loss(posterior, at, before.sensor, components(posterior))
+    model_average = least_loss(posterior, at, before.sensor, components(posterior), any_certain=any_certain)
     rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in model_average.sensor.effects for name in effect.needs)
     after = replace(

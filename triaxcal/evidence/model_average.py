@@ -52,6 +52,8 @@ class Refusal(StrEnum):
     way, or its channels."""
     ONE_POSE = "one_pose"
     """A name is certain, and without some single pose unlikelier than not."""
+    GAIN = "gain"
+    """No name is certain, and the expected error would fall too little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,15 +98,20 @@ def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | N
     return _of_likely(posterior, None, at, mixture)
 
 
-def least_loss(posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]) -> Average:
+def least_loss(
+    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components], *, any_certain: bool
+) -> Average:
     """What is handed on: of the ``linear`` sensor and the averages that the
-    posterior allows (`refusal`) the one with the least expected error."""
+    posterior allows (`refusal`) the one with the least expected error.
+    ``any_certain`` where some name, or one of a group of names, certainly acts:
+    its correction needs no gain."""
     sphere = OverSphere.of(posterior, at, mixture)
     alone = _linear_alone(posterior, at, linear, mixture, sphere)
     why = refusal(posterior)
     if why is None:
         made = _of_likely(posterior, sphere, at, mixture)
-        return made if made.sensor.effects else alone
+        pays = any_certain or made.loss <= posterior.evidence.odds.gain_by_names * alone.loss
+        return made if made.sensor.effects and pays else alone
     if why is not Refusal.UNMODELLED:
         return alone
     whole = _smooth(posterior, sphere, at, linear, mixture)

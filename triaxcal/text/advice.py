@@ -33,6 +33,7 @@ REFUSED = {
     Refusal.UNMODELLED: "something that no effect describes acts as well",
     Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
     Refusal.ONE_POSE: "what was found hangs on a single pose",
+    Refusal.GAIN: "no name is certain, and the expected error would fall too little",
 }
 
 

@@ -131,7 +131,7 @@ def _caption(trace: Trace, outcome: Outcome) -> str:
 
 
 def _of_finding(finding: Finding) -> str:
-    sure = f"Probability {chance(finding.probability)}"
+    sure = "Probable" if finding.probability is None else f"Probability {chance(finding.probability)}"
     if finding.alternatives:
         return f"{sure}; or instead {', '.join(effect_title(n).lower() for n in finding.alternatives[:3])}"
     return sure + (", not certain" if finding.verdict == CANDIDATE else "")
