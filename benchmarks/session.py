@@ -61,7 +61,7 @@ def told(asked: tuple[int, int]) -> Told:
     following = poses_of(runs + 1, sensor) if runs < 5 else None
     shape = {e.name: dict(e.shape) for e, _ in loop.after.sensor.effects if e.shape}
     found = [f"{f.effect} {f.verdict.value} {_shape(shape.get(f.effect, {}))}".strip() for f in loop.findings]
-    found += [f"{c.effect} {c.probability:.2f}" for c in loop.candidates]
+    found += [f"{c.effect} {loop.probabilities[c.effect]:.2f}" for c in loop.candidates]
     found += [f"not corrected: {loop.refusal.value}"] if loop.refusal else []
     return Told(
         sensor,

@@ -247,8 +247,10 @@ def describe(case: Case) -> str:
             f"{[i for i, p in enumerate(part.poses) if not p.used]}"
         )
     for f in loop.findings:
-        lines.append(f"{f.effect} {f.verdict} {f.probability:.4f} {dict(f.alternatives)} {dict(f.coefficients)}")
-    lines += [f"{c.effect} likely {c.probability:.3f} {dict(c.coefficients)}" for c in loop.candidates]
+        lines.append(
+            f"{f.effect} {f.verdict} {loop.probabilities[f.effect]:.4f} {dict(f.alternatives)} {dict(f.coefficients)}"
+        )
+    lines += [f"{c.effect} likely {loop.probabilities[c.effect]:.3f} {dict(c.coefficients)}" for c in loop.candidates]
     lines.append(f"probabilities: { {name: round(p, 3) for name, p in loop.probabilities.items() if p >= 0.01} }")
     lines.append(f"outliers: {dict(loop.found.outliers)}; nothing: {loop.found.nothing:.3f}; refused: {loop.refusal}")
     lines.append(f"unexplained: {loop.found.unexplained}")
