@@ -66,6 +66,12 @@ def waits(trouble: str) -> str:
     return f"waiting: {trouble}"
 
 
+def waited_for(trouble: str, *, endless: bool) -> str:
+    """What is the matter with a unit or a bus that is lost; where that is waited
+    for without a limit, how to set one."""
+    return f"{trouble}; the wait has no end, unless --give-up-after S sets one" if endless else trouble
+
+
 def nothing_deleted(document: str) -> str:
     """Of retention that may not delete what a document may name."""
     return f"nothing is deleted, as {document} cannot be read, and may name any segment"
