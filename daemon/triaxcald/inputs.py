@@ -35,7 +35,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION
-from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, Phase
+from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
@@ -50,7 +50,8 @@ UNKNOWN_NOISE = "unknown_noise"
 @dataclass(frozen=True)
 class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
-    ``too_short`` says why no pose could be among the samples, if so.
+    ``too_short`` says why no pose could be among the samples, if so;
+    ``unconfirmed`` that most of what was recorded is not used, and why.
 
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the
     recording was made with, where it says; ``unit`` is its name and serial;
@@ -72,6 +73,7 @@ class Measured:
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
     too_short: TooShort | None = None
+    unconfirmed: str = ""
     parted: Callable[[float | None], Measured] | None = None
 
 
@@ -158,7 +160,9 @@ def _measure_recording(
 ) -> Measured:
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
+    used = 0
     for batch in recording.raw(phase):
+        used += len(batch)
         block = pipeline.rising(batch)
         if moments is not None:
             moments.feed(block.readings, block.channels.get(TEMPERATURE))
@@ -177,7 +181,7 @@ def _measure_recording(
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
     read = Measured(
         recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at,
-        too_short=pipeline.too_short(),
+        too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
     )  # fmt: skip
 
     def parted(turn_s: float | None) -> Measured:
@@ -220,6 +224,20 @@ def losses_of(recording: Contents) -> list[str]:
     if unconfirmed := recording.unconfirmed_records():
         found.append(f"unconfirmed_records: {text.unconfirmed(unconfirmed)}")
     return found
+
+
+def _mostly_unconfirmed(recording: Contents, phase: Phase, used: int) -> str:
+    """Why most records of the phase are not used, of which ``used`` are; empty
+    where most are: what else is wrong with them may matter more then."""
+    if not recording.any_unconfirmed:
+        return ""
+    unconfirmed = sum(len(b) for name, b in recording.joined_batches() if b.unconfirmed and name == phase)
+    if unconfirmed <= used:
+        return ""
+    told = [
+        e.detail.get("error") for e in recording.events() if e.kind == UNCONFIRMED and isinstance(e.detail, Mapping)
+    ]
+    return text.mostly_unconfirmed(unconfirmed, unconfirmed + used, str(told[-1]) if told and told[-1] else "")
 
 
 def _were(records: int) -> str:

@@ -54,6 +54,14 @@ def unconfirmed(records: int) -> str:
     )
 
 
+def mostly_unconfirmed(unconfirmed: int, records: int, why: str) -> str:
+    """``why`` is by what another unit was noticed, where that is known."""
+    return (
+        f"{unconfirmed} of {number_of(records, 'record')} are unconfirmed, and not used: "
+        f"{why or 'another unit answered'}; record it again with the right unit alone there"
+    )
+
+
 def two_senders(where: str, stream: str) -> str:
     return (
         f"two units answer at {where}: stream {stream} has two senders, each with samples of its own; "

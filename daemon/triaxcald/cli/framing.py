@@ -27,7 +27,7 @@ from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, show, table
-from triaxcald.cli.showing import chosen, read_recording, warn
+from triaxcald.cli.showing import chosen, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DONE, OUTSIDE
 from triaxcald.files import write_text
@@ -129,16 +129,17 @@ def _placed(
     Labels, where they count the poses, say how many of the longest were
     turns."""
     measured = read_recording(a, name, turn_s=TURN_S)
-    source = _source(a, measured, name, calibration, taken)
-    try:
-        return source, _stand(source, given, assumed)
-    except Miscounted:
-        for turn_s in _lengths(measured):
-            with suppress(InvalidData, Refused):
-                assert measured.parted is not None
-                source = _source(a, measured.parted(turn_s), name, calibration, taken)
-                return source, _stand(source, given, assumed)
-        raise
+    with telling_data_quality(measured):
+        source = _source(a, measured, name, calibration, taken)
+        try:
+            return source, _stand(source, given, assumed)
+        except Miscounted:
+            for turn_s in _lengths(measured):
+                with suppress(InvalidData, Refused):
+                    assert measured.parted is not None
+                    source = _source(a, measured.parted(turn_s), name, calibration, taken)
+                    return source, _stand(source, given, assumed)
+            raise
 
 
 def _lengths(measured: Measured) -> list[float]:
