@@ -24,7 +24,8 @@ from triaxcal.poses.quality import QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import StillnessDetector, Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
-from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.file_kind import special_kind
+from triaxcal_drivers.files import TooLarge, read_whole
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
@@ -280,15 +281,30 @@ def bundle_of(recording: Contents) -> Bundle:
 
 def read_document(path: str) -> Mapping[str, Any]:
     """A JSON document. Raises InputError with the line at fault."""
+    return parse_document(document_bytes(path), where=path)
+
+
+def document_bytes(path: str) -> bytes:
+    """Of the file that is to be a JSON document. Raises InputError."""
     try:
-        return parse_document(read_whole(Path(path), DOCUMENT_MOST, pipe=True), where=path)
+        return read_whole(Path(path), DOCUMENT_MOST, pipe=True)
+    except TooLarge as e:
+        _require_no_other_kind(e.head, path)
+        raise InputError(f"{path}: {e.strerror}") from e
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
 
 
+def _require_no_other_kind(data: bytes, where: str) -> None:
+    if known := special_kind(data, json=False):
+        raise InputError(f"{where}: {known}, expected a JSON document, such as a calibration")
+
+
 def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
     """An object of JSON in which no key is given twice. Raises InputError with
-    the line at fault."""
+    the line at fault, or with what the data are where they are of another
+    kind."""
+    _require_no_other_kind(data, where)
     try:
         text = data.decode()
         document = json.loads(text, object_pairs_hook=_each_key_once)

@@ -18,7 +18,7 @@ from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, oppos
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
-from triaxcal.interchange.calibration_reading import sensor_of
+from triaxcal.interchange.calibration_reading import but_is, sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.number_format import probability
 from triaxcal.poses.stillness.detector import find_spans
@@ -93,7 +93,7 @@ def _planned(path: str | None, names: Sequence[str]) -> list[Labels | None]:
         return [None] * len(names)
     document = read_document(path)
     if document.get("format") != "triaxcal.plan/1":
-        raise InputError(f"{path}: format: expected triaxcal.plan/1")
+        raise InputError(f"{path}: format: expected triaxcal.plan/1{but_is(document)}")
     poses = document.get("poses")
     if not isinstance(poses, list) or not poses:
         raise InputError(f"{path}: poses: expected a list of poses")
