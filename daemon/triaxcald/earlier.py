@@ -15,10 +15,8 @@ from triaxcal.effects.contract import channel_of, is_derived
 from triaxcal.errors import Refused
 from triaxcal.inputs.bias_update import Earlier, require_known
 from triaxcal.units import same_unit
-from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.profile import READINGS
-from triaxcald.errors import InputError
-from triaxcald.inputs import DOCUMENT_MOST, parse_document
+from triaxcald.inputs import document_bytes, parse_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.config import Place, Station
 
@@ -41,11 +39,7 @@ class EarlierFile:
     @classmethod
     def read(cls, path: str) -> EarlierFile:
         """Raises InputError, InvalidData."""
-        try:
-            data = read_whole(Path(path), DOCUMENT_MOST, pipe=True)
-        except OSError as e:
-            raise InputError(f"{path}: {e.strerror}") from e
-        return cls.parsed(data, path)
+        return cls.parsed(document_bytes(path), path)
 
     @classmethod
     def parsed(cls, data: bytes, name: str) -> EarlierFile:

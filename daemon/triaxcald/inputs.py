@@ -24,7 +24,8 @@ from triaxcal.poses.quality import QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import StillnessDetector, Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
-from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.file_kind import special_kind
+from triaxcal_drivers.files import TooLarge, read_whole
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
@@ -35,7 +36,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION
-from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, Phase
+from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
@@ -50,7 +51,8 @@ UNKNOWN_NOISE = "unknown_noise"
 @dataclass(frozen=True)
 class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
-    ``too_short`` says why no pose could be among the samples, if so.
+    ``too_short`` says why no pose could be among the samples, if so;
+    ``unconfirmed`` that most of what was recorded is not used, and why.
 
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the
     recording was made with, where it says; ``unit`` is its name and serial;
@@ -72,6 +74,7 @@ class Measured:
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
     too_short: TooShort | None = None
+    unconfirmed: str = ""
     parted: Callable[[float | None], Measured] | None = None
 
 
@@ -158,7 +161,9 @@ def _measure_recording(
 ) -> Measured:
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
+    used = 0
     for batch in recording.raw(phase):
+        used += len(batch)
         block = pipeline.rising(batch)
         if moments is not None:
             moments.feed(block.readings, block.channels.get(TEMPERATURE))
@@ -177,7 +182,7 @@ def _measure_recording(
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
     read = Measured(
         recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at,
-        too_short=pipeline.too_short(),
+        too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
     )  # fmt: skip
 
     def parted(turn_s: float | None) -> Measured:
@@ -222,6 +227,20 @@ def losses_of(recording: Contents) -> list[str]:
     return found
 
 
+def _mostly_unconfirmed(recording: Contents, phase: Phase, used: int) -> str:
+    """Why most records of the phase are not used, of which ``used`` are; empty
+    where most are: what else is wrong with them may matter more then."""
+    if not recording.any_unconfirmed:
+        return ""
+    unconfirmed = sum(len(b) for name, b in recording.joined_batches() if b.unconfirmed and name == phase)
+    if unconfirmed <= used:
+        return ""
+    told = [
+        e.detail.get("error") for e in recording.events() if e.kind == UNCONFIRMED and isinstance(e.detail, Mapping)
+    ]
+    return text.mostly_unconfirmed(unconfirmed, unconfirmed + used, str(told[-1]) if told and told[-1] else "")
+
+
 def _were(records: int) -> str:
     return f"{number_of(records, 'record')} {'was' if records == 1 else 'were'}"
 
@@ -262,15 +281,30 @@ def bundle_of(recording: Contents) -> Bundle:
 
 def read_document(path: str) -> Mapping[str, Any]:
     """A JSON document. Raises InputError with the line at fault."""
+    return parse_document(document_bytes(path), where=path)
+
+
+def document_bytes(path: str) -> bytes:
+    """Of the file that is to be a JSON document. Raises InputError."""
     try:
-        return parse_document(read_whole(Path(path), DOCUMENT_MOST, pipe=True), where=path)
+        return read_whole(Path(path), DOCUMENT_MOST, pipe=True)
+    except TooLarge as e:
+        _require_no_other_kind(e.head, path)
+        raise InputError(f"{path}: {e.strerror}") from e
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
 
 
+def _require_no_other_kind(data: bytes, where: str) -> None:
+    if known := special_kind(data, json=False):
+        raise InputError(f"{where}: {known}, expected a JSON document, such as a calibration")
+
+
 def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
     """An object of JSON in which no key is given twice. Raises InputError with
-    the line at fault."""
+    the line at fault, or with what the data are where they are of another
+    kind."""
+    _require_no_other_kind(data, where)
     try:
         text = data.decode()
         document = json.loads(text, object_pairs_hook=_each_key_once)

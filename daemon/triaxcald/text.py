@@ -54,6 +54,14 @@ def unconfirmed(records: int) -> str:
     )
 
 
+def mostly_unconfirmed(unconfirmed: int, records: int, why: str) -> str:
+    """``why`` is by what another unit was noticed, where that is known."""
+    return (
+        f"{unconfirmed} of {number_of(records, 'record')} are unconfirmed, and not used: "
+        f"{why or 'another unit answered'}; record it again with the right unit alone there"
+    )
+
+
 def two_senders(where: str, stream: str) -> str:
     return (
         f"two units answer at {where}: stream {stream} has two senders, each with samples of its own; "
@@ -64,6 +72,12 @@ def two_senders(where: str, stream: str) -> str:
 def waits(trouble: str) -> str:
     """Of a unit or a bus that is lost for now."""
     return f"waiting: {trouble}"
+
+
+def waited_for(trouble: str, *, endless: bool) -> str:
+    """What is the matter with a unit or a bus that is lost; where that is waited
+    for without a limit, how to set one."""
+    return f"{trouble}; the wait has no end, unless --give-up-after S sets one" if endless else trouble
 
 
 def nothing_deleted(document: str) -> str:

@@ -10,6 +10,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 
+class TooLarge(OSError):
+    """``head`` is what was read of a file of more than ``most`` bytes."""
+
+    def __init__(self, most: int, head: bytes) -> None:
+        super().__init__(errno.EFBIG, f"larger than the {size(most)} that such a file may have")
+        self.head = head
+
+
 def open_file(path: Path, *, pipe: bool = False) -> BinaryIO:
     """A file to read from; with ``pipe`` also a pipe, where the user gave the
     name: `<(…)` of the shell is one.
@@ -44,11 +52,11 @@ def _require_file(mode: int, pipe: bool) -> None:
 
 def read_whole(path: Path, most: int, *, pipe: bool = False) -> bytes:
     """All of a file of at most ``most`` bytes. Raises OSError with a reason to
-    show."""
+    show, TooLarge for a larger one."""
     with open_file(path, pipe=pipe) as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise OSError(errno.EFBIG, f"larger than the {size(most)} that such a file may have")
+        raise TooLarge(most, data)
     return data
 
 

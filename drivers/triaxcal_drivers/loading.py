@@ -12,7 +12,7 @@ from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.files import inside, read_whole, size
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import Bundle
-from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
+from triaxcal_drivers.toml_text import PROFILE, parse_toml, read_toml
 from triaxcal_drivers.validation import validate
 
 BUILT_IN = Path(__file__).parent / "profiles"
@@ -28,7 +28,7 @@ def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, 
     Raises ProfileError (one line: where, line, field, what was expected),
     DriverMissing.
     """
-    data = parse_toml(text, where=where)
+    data = parse_toml(text, where=where, expected=PROFILE)
     name = data.get("driver")
     if not isinstance(name, str):
         raise ProfileError(f'{where}: driver: expected the name of a driver, as in driver = "can"')
@@ -66,7 +66,7 @@ def load_bundle(path: Path) -> Bundle:
         if os.path.exists(built_in):
             path = built_in
     try:
-        text = read_whole(path, SIZE_MOST)
+        text = read_toml(path, expected=PROFILE)
     except FileNotFoundError as e:
         known = sorted(p.stem for p in BUILT_IN.glob("*.toml"))
         raise ProfileError(f"{path}: {e.strerror}; built-in profiles: {', '.join(known)}") from e

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import re
 import tomllib
+from pathlib import Path
 from typing import Any
 
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.file_kind import special_kind
+from triaxcal_drivers.files import TooLarge, read_whole, size
 
 SIZE_MOST = 256 * 2**10
 """Bytes. A profile of a hundred registers has 15 KiB, a unit in a station file
@@ -24,16 +27,46 @@ _TOKENS = re.compile(
 )
 
 
-def parse_toml(text: bytes, *, where: str) -> dict[str, Any]:
-    """Raises ProfileError with the line at fault."""
+PROFILE, STATION, DEVICE = "triaxcal.profile/1", "triaxcal.station/1", "triaxcal.device/1"
+_CALLED = {PROFILE: "a profile", STATION: "a station file", DEVICE: "the file of a simulated device"}
+
+
+def read_toml(path: Path, *, expected: str, pipe: bool = False) -> bytes:
+    """All of a file of this format. Raises OSError with a reason to show."""
+    try:
+        return read_whole(path, SIZE_MOST, pipe=pipe)
+    except TooLarge as e:
+        if known := special_kind(e.head, toml=False):
+            raise OSError(e.errno, f"{known}, expected {_called(expected)}") from None
+        raise OSError(e.errno, f"larger than the {size(SIZE_MOST)} that {_CALLED[expected]} may have") from None
+
+
+def parse_toml(text: bytes, *, where: str, expected: str | None = None) -> dict[str, Any]:
+    """Raises ProfileError with the line at fault, or with what the text is where
+    it is of another kind than ``expected``, one of the formats. A format that
+    nobody knows is left to whoever validates."""
+    if known := special_kind(text, toml=False):
+        raise ProfileError(f"{where}: {known}, expected {_called(expected)}")
+    data = _parsed(text, where, "" if expected is None else f"; expected {_called(expected)}")
+    named = data.get("format")
+    if expected is not None and isinstance(named, str) and named in _CALLED and named != expected:
+        raise ProfileError(f"{where}: {_called(named)}, expected {_called(expected)}")
+    return data
+
+
+def _called(expected: str | None) -> str:
+    return "TOML" if expected is None else f"{_CALLED[expected]} ({expected})"
+
+
+def _parsed(text: bytes, where: str, expected: str) -> dict[str, Any]:
     try:
         shown = text.decode("utf-8")
         _bound(shown, where)
         return tomllib.loads(shown)
     except UnicodeDecodeError as e:
-        raise ProfileError(f"{where}: not UTF-8 text (byte {e.start})") from e
+        raise ProfileError(f"{where}: not UTF-8 text (byte {e.start}){expected}") from e
     except ValueError as e:
-        raise ProfileError(f"{where}: not TOML: {e}") from e
+        raise ProfileError(f"{where}: not TOML: {e}{expected}") from e
 
 
 def _bound(text: str, where: str) -> None:

@@ -4,6 +4,7 @@ name the file and the field."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,8 @@ from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.units import reference_unit_of
 
+_WITH_CALIBRATION = ("triaxcal.calibration/1", "triaxcal.loop/1", "triaxcal.certificate/1")
+
 
 def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str, Any]:
     """The `triaxcal.calibration/1` in a calibration, loop or certificate
@@ -29,8 +32,17 @@ def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str,
         if isinstance(inner, Mapping) and isinstance(inner.get(key), Mapping):
             inner = inner[key]
     if not isinstance(inner, Mapping) or inner.get("format") != "triaxcal.calibration/1":
-        raise InvalidData(f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document")
+        raise InvalidData(
+            f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document"
+            + ("" if document.get("format") in _WITH_CALIBRATION else but_is(document))
+        )
     return inner
+
+
+def but_is(document: Mapping[str, Any]) -> str:
+    """For the end of a message: which format a document has, where it says."""
+    named = document.get("format")
+    return f", not {named}" if isinstance(named, str) and re.fullmatch(r"[\w.-]{1,40}/\d{1,4}", named) else ""
 
 
 def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:

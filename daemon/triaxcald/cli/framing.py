@@ -18,7 +18,7 @@ from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, oppos
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
-from triaxcal.interchange.calibration_reading import sensor_of
+from triaxcal.interchange.calibration_reading import but_is, sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.number_format import probability
 from triaxcal.poses.stillness.detector import find_spans
@@ -27,7 +27,7 @@ from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, show, table
-from triaxcald.cli.showing import chosen, read_recording, warn
+from triaxcald.cli.showing import chosen, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DONE, OUTSIDE
 from triaxcald.files import write_text
@@ -93,7 +93,7 @@ def _planned(path: str | None, names: Sequence[str]) -> list[Labels | None]:
         return [None] * len(names)
     document = read_document(path)
     if document.get("format") != "triaxcal.plan/1":
-        raise InputError(f"{path}: format: expected triaxcal.plan/1")
+        raise InputError(f"{path}: format: expected triaxcal.plan/1{but_is(document)}")
     poses = document.get("poses")
     if not isinstance(poses, list) or not poses:
         raise InputError(f"{path}: poses: expected a list of poses")
@@ -129,16 +129,17 @@ def _placed(
     Labels, where they count the poses, say how many of the longest were
     turns."""
     measured = read_recording(a, name, turn_s=TURN_S)
-    source = _source(a, measured, name, calibration, taken)
-    try:
-        return source, _stand(source, given, assumed)
-    except Miscounted:
-        for turn_s in _lengths(measured):
-            with suppress(InvalidData, Refused):
-                assert measured.parted is not None
-                source = _source(a, measured.parted(turn_s), name, calibration, taken)
-                return source, _stand(source, given, assumed)
-        raise
+    with telling_data_quality(measured):
+        source = _source(a, measured, name, calibration, taken)
+        try:
+            return source, _stand(source, given, assumed)
+        except Miscounted:
+            for turn_s in _lengths(measured):
+                with suppress(InvalidData, Refused):
+                    assert measured.parted is not None
+                    source = _source(a, measured.parted(turn_s), name, calibration, taken)
+                    return source, _stand(source, given, assumed)
+            raise
 
 
 def _lengths(measured: Measured) -> list[float]:

@@ -79,6 +79,7 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
         name=f"{first.name} and {len(recordings) - 1} more",
         poses=together([m.poses for m in recordings]),
         windows=None,
+        unconfirmed=first.unconfirmed if all(m.unconfirmed for m in recordings) else "",
         data_quality=[line for m in recordings for line in named_quality(m)],
         unit=next((m.unit for m in recordings if m.unit), None),
     )

@@ -60,7 +60,9 @@ def read_recording(
         require_same_outputs(of, name, a.output_unit or found.output_unit)
     for remark in found.remarks:
         say(f"{found.name}: {remark}")
-    if not found.poses and moments is None:
+    if found.unconfirmed:
+        say(f"{found.name}: {found.unconfirmed}")
+    elif not found.poses and moments is None:
         turns = "the unit never rests; `triaxcal fit --turning` is for a unit that turns all the time"
         say(f"{found.name}: {found.too_short or turns}")
     return found
@@ -146,9 +148,12 @@ def warn(lines: Iterable[str]) -> None:
 
 @contextmanager
 def telling_data_quality(measured: Measured) -> Iterator[None]:
-    """What spoils a recording may be why it is refused."""
+    """What spoils a recording may be why it is refused. Further poses mend none
+    of which most is not used."""
     try:
         yield
-    except Refused:
+    except Refused as e:
         warn(measured.data_quality)
+        if measured.unconfirmed and e.wanted:
+            raise Refused(str(e)) from e
         raise

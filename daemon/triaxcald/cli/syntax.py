@@ -97,7 +97,7 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--unit", help="or bus, where the station has more than one; default, with a FOLDER: all of them")
     p.add_argument(
-        "--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit or a bus; default: never"
+        "--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit or a bus; default: without end"
     )
     p.add_argument(
         "--segment-size", type=size, metavar="SIZE", help="a new file after so much, as 256M, with a manifest"

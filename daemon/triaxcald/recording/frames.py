@@ -38,6 +38,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from triaxcal_drivers.file_kind import HEAD as HEAD_LOOKED_AT
+from triaxcal_drivers.file_kind import kind
 from triaxcald.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -101,12 +103,13 @@ def check_magic(stream: BinaryIO, name: str) -> None:
     """Raises CutShort where the file ends inside the magic, RecordingError
     where it is something else."""
     stream.seek(0)
-    magic = stream.read(len(MAGIC))
+    head = stream.read(HEAD_LOOKED_AT)
+    magic = head[: len(MAGIC)]
     if magic == MAGIC:
         return
     if MAGIC.startswith(magic):
         raise CutShort(name, 0, "the file ends")
-    raise RecordingError(f"{name}: not an MCAP file: it begins with {magic!r}, expected {MAGIC!r}")
+    raise RecordingError(f"{name}: not an MCAP file but {kind(head)}, expected a recording (.mcap)")
 
 
 def size_of(stream: BinaryIO) -> int:

@@ -54,23 +54,24 @@ class BusRecording(AtRecording):
         return self._listened.seconds
 
     async def _work(self, seconds: float | None, patience: Patience) -> None:
-        async with self._place.opened(patience, lambda trouble: self._is_lost(str(trouble))) as listener:
+        is_lost = partial(self._is_lost, patience)
+        async with self._place.opened(patience, lambda trouble: is_lost(str(trouble))) as listener:
             self._path = self._path_of()
 
             async def record(writer: RecordingWriter) -> None:
                 self._progress.stage(self.name, "recording")
-                await self._listened.for_seconds(ReturningBus(listener, patience, self._is_lost), writer, seconds)
+                await self._listened.for_seconds(ReturningBus(listener, patience, is_lost), writer, seconds)
 
             make = partial(self._new_writer, self._path)
             await self._recorded_by(make, record, self._path if self._segments else None)
 
-    def _is_lost(self, trouble: str | None) -> None:
+    def _is_lost(self, patience: Patience, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
         self._trouble = trouble
         if trouble is None:
             self._progress.stage(self.name, text.BUS_IS_BACK)
         else:
-            self._progress.lost(self.name, trouble)
+            self._progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
 
     def _new_writer(self, path: Path) -> RecordingWriter:
         """With the station file in it. Raises RecordingError."""

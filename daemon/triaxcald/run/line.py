@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +133,8 @@ class UnitRun(UnitSession):
         the outcome."""
         ending: Ending | None = None
         try:
-            async with self.place.opened(Patience(others=self.others), self.waits) as device:
+            patience = Patience(others=self.others)
+            async with self.place.opened(patience, partial(self.waits, patience)) as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)

@@ -74,9 +74,9 @@ class UnitSession:
         """Its serial number may be that of another unit of the station."""
         self.serials.discard(self.name)
 
-    def waits(self, trouble: Exception) -> None:
+    def waits(self, patience: Patience, trouble: Exception) -> None:
         """The unit is not there, for now."""
-        self.progress.lost(self.name, str(trouble))
+        self.progress.lost(self.name, text.waited_for(str(trouble), endless=patience.endless))
 
     def returning(
         self,
@@ -99,7 +99,7 @@ class UnitSession:
             if trouble is None:
                 self.progress.stage(self.name, text.IS_BACK)
             else:
-                self.progress.lost(self.name, trouble)
+                self.progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
 
         # A unit of which a sample is rare is not silent before its profile says so.
         hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)

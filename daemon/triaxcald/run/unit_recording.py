@@ -61,9 +61,9 @@ class UnitRecording(AtRecording):
     def _latest(self) -> dict[str, float]:
         return dict(self._recorded.latest)
 
-    def _waits(self, trouble: Exception) -> None:
+    def _waits(self, patience: Patience, trouble: Exception) -> None:
         self._is_lost(str(trouble))
-        self._session.waits(trouble)
+        self._session.waits(patience, trouble)
 
     def _is_lost(self, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
@@ -79,7 +79,7 @@ class UnitRecording(AtRecording):
         async def identify(device: Device) -> None:
             found[:] = [await session.identify(device)]
 
-        async with session.place.opened(patience, self._waits, identify) as device:
+        async with session.place.opened(patience, partial(self._waits, patience), identify) as device:
             (identity,) = found
             self._identified(session, identity)
             self._path = self._path_of(identity)

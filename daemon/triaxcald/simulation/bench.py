@@ -21,11 +21,10 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import COVARIATES, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.profile import Bundle, Strict
-from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
+from triaxcal_drivers.toml_text import DEVICE, parse_toml, read_toml
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
@@ -122,10 +121,10 @@ class SyntheticPhysics:
 def load_device(path: Path) -> DeviceFile:
     """Raises InputError, ProfileError."""
     try:
-        text = read_whole(path, SIZE_MOST, pipe=True)
+        text = read_toml(path, expected=DEVICE, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
-    return validate(DeviceFile, parse_toml(text, where=str(path)), text, where=str(path))
+    return validate(DeviceFile, parse_toml(text, where=str(path), expected=DEVICE), text, where=str(path))
 
 
 def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:

@@ -98,12 +98,23 @@ class Patience:
     others: AtWork | None = None
     in_use: bool = False
 
+    @property
+    def endless(self) -> bool:
+        """Whether a unit is never given up."""
+        return self.most_s is None and self.others is None
+
+    def is_over(self, waited_s: float) -> bool:
+        """Whether a unit is given up after ``waited_s``."""
+        if self.most_s is not None and waited_s > self.most_s - TICK_S:
+            return True
+        return self.others is not None and waited_s >= self.least_s and self.others.nobody.is_set()
+
     async def rest(self, pause_s: float, waited_s: float) -> bool:
         """Waits ``pause_s``, or less. False where the unit is given up after
         ``waited_s``."""
+        if self.is_over(waited_s):
+            return False
         if self.most_s is not None:
-            if waited_s > self.most_s - TICK_S:
-                return False
             pause_s = min(pause_s, self.most_s - waited_s)
         if self.others is None:
             await asyncio.sleep(pause_s)
@@ -154,9 +165,11 @@ class _Waiting:
         self, attempt: Callable[[], Awaitable[None]], mended: tuple[type[Exception], ...], trouble: Exception
     ) -> None:
         """Attempts until it works. Raises the last trouble once patience ends,
-        and at once what is none of those that an attempt may have
-        ``mended``."""
+        which is told only where it is waited for; and at once what is none of
+        those that an attempt may have ``mended``."""
         while True:
+            if self.attempted and self.patience.is_over(self.waited_s):
+                raise trouble
             self.say(trouble)
             if self.attempted and not await self._rest():
                 raise trouble
@@ -213,7 +226,7 @@ async def until_open(
 ) -> None:
     """Attempts again until it works. Raises the last trouble of those that an
     attempt may have ``mended`` once patience ends; ``tell`` is told each one
-    that is new."""
+    that is new and waited for."""
     try:
         await attempt()
     except mended as e:

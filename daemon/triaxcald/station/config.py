@@ -20,12 +20,11 @@ from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
-from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
+from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
@@ -300,14 +299,14 @@ class Station:
 
 def parse_station(text: bytes, *, where: str) -> StationFile:
     """Raises ProfileError with file, line and field."""
-    return validate(StationFile, parse_toml(text, where=where), text, where=where)
+    return validate(StationFile, parse_toml(text, where=where, expected=STATION), text, where=where)
 
 
 def load_station(path: Path) -> Station:
     """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line
     with file, line and field."""
     try:
-        text = read_whole(path, SIZE_MOST, pipe=True)
+        text = read_toml(path, expected=STATION, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
     file = parse_station(text, where=str(path))

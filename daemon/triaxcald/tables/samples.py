@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal_drivers.file_kind import document_kind
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
@@ -67,6 +68,8 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
             return _table_of(grid_of_parquet(Path(name)), reading, beside)
         data = blocks(name, label)
         first = next(data, b"")
+        if known := document_kind(first):
+            raise Unclear(f"{known}, expected a recording (.mcap) or a table of samples")
         own = replace(reading, wanted=frozenset()) == Reading() and is_own(first)
         if own and holds_text(whole_lines(first)):
             grid = grid_of_own(b"".join(chain((first,), data)), label)

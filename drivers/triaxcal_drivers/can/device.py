@@ -270,7 +270,7 @@ class CanDevice:
                 if batch:
                     yield batch  # which may take whoever has it a while
                 if booted.is_set():
-                    raise DeviceRestarted(f"{self._settings} has restarted: it sent its boot-up message")
+                    raise DeviceRestarted(f"a unit at {self._settings} has started: it sent its boot-up message")
                 if silent:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from triaxcal_drivers.errors import LogError
+from triaxcal_drivers.file_kind import special_kind
 from triaxcal_drivers.files import open_file
 from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
 from triaxcal_drivers.logs.frames import Account, LoggedFrame
@@ -114,8 +115,10 @@ def opened(path: Path) -> Iterator[Log]:
             raise LogError(f"{path}: cannot be read: {_reason(e)}") from e
         kind = kind_of(head)
         if kind is None:
-            empty = "; the file is empty" if not head else ""
-            raise LogError(f"{path}: no log of a known kind, expected {NAMES}{empty}")
+            told = "; the file is empty" if not head else ""
+            if known := special_kind(head):
+                told = f"; the file is {known}"
+            raise LogError(f"{path}: no log of a known kind, expected {NAMES}{told}")
         seeks = kind.seeks if isinstance(kind, Kind) else True
         if stream is not file and seeks:
             with tempfile.TemporaryFile() as whole:

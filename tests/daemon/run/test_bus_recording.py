@@ -269,7 +269,24 @@ async def test_a_folder_that_is_removed_ends_the_recording_of_a_bus_that_brings_
     assert "the file, or its folder, was removed" in kept.error
 
 
-async def test_a_bus_that_is_not_there_is_waited_for_and_given_up(workshop: Any, port: Path) -> None:
+@pytest.mark.parametrize("most_s", [None, 60.0], ids=["without end", "a minute"])
+async def test_whoever_waits_for_a_bus_without_end_is_told_how_to_set_one(
+    workshop: Any, port: Path, most_s: float | None
+) -> None:
+    station = load_station(
+        workshop.station(buses=[{"name": "dongle", "bus": {"interface": "slcan", "channel": str(port)}}])
+    )
+    told = Told()
+    work = asyncio.ensure_future(
+        listening(station, told, workshop.folder / "bus.mcap").run(None, Patience(most_s=most_s))
+    )
+    await told.until("dongle", lambda text: text.startswith("lost: "))
+    work.cancel()
+    await work
+    assert ("--give-up-after" in told.stages["dongle"][0]) is (most_s is None)
+
+
+async def test_a_bus_that_is_not_there_is_given_up(workshop: Any, port: Path) -> None:
     bus = {"interface": "slcan", "channel": str(port)}
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, path = Told(), workshop.folder / "bus.mcap"
@@ -277,5 +294,5 @@ async def test_a_bus_that_is_not_there_is_waited_for_and_given_up(workshop: Any,
     assert (kept.exit_code, kept.path) == (4, None)
     assert kept.error is not None
     assert kept.error.startswith(f"bus dongle: cannot open slcan {port}: ")
-    assert told.stages["dongle"][0].startswith("lost: cannot open slcan")
+    assert not told.stages, "what is not waited for is an error alone"
     assert not path.exists()

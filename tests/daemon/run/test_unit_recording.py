@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,19 @@ CAN = {"profile": "triax-ref-can", "serial": 12}
 MODBUS = {"profile": "triax-ref-modbus", "serial": 4711}
 
 
+@pytest.mark.parametrize("most_s", [None, 60.0], ids=["without end", "a minute"])
+async def test_whoever_waits_for_a_unit_without_end_is_told_how_to_set_one(workshop: Any, most_s: float | None) -> None:
+    station = load_station(workshop.station({"name": "u", "bus": {"host": "127.0.0.1", "port": 1}}))
+    told = Told()
+    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=most_s))
+    await told.until("u", lambda text: text.startswith("lost: "))
+    work.cancel()
+    with suppress(asyncio.CancelledError):
+        await work
+    told_so = [text for text in told.stages["u"] if text.startswith("lost: ")]
+    assert ("--give-up-after" in told_so[0]) is (most_s is None)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["can", "modbus"])
 async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
@@ -156,9 +170,10 @@ async def test_a_unit_that_another_process_works_with_is_waited_for(workshop: An
     claim = claim_of(station.places[0].bus)
     with another_process(device=claim.device, host=claim.host):
         work = recorded(station, workshop.folder, told, seconds=0.2, patience=patience)
-        await told.until("unit0", lambda text: " is in use by `" in text)
         if given_up:
             await work
+        else:
+            await told.until("unit0", lambda text: " is in use by `" in text)
     (kept,) = await work
     await bench.take(0)
     assert kept.exit_code == (4 if given_up else 0)

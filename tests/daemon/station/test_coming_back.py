@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -321,6 +321,30 @@ def test_a_lost_unit_is_given_up_when_the_others_are_done() -> None:
         return attempts
 
     assert len(run(work())) > 10
+
+
+@pytest.mark.parametrize(
+    ("patience", "told"),
+    [
+        (lambda: Patience(most_s=0.0), []),
+        (lambda: Patience(most_s=3.0), ["nothing answers"]),
+        (lambda: Patience(others=AtWork(1)), []),
+        (lambda: Patience(least_s=3.0, others=AtWork(1)), ["nothing answers"]),
+    ],
+    ids=["at once", "later", "alone", "alone, later"],
+)
+def test_only_what_is_waited_for_is_told(patience: Callable[[], Patience], told: list[str]) -> None:
+    async def work() -> list[str]:
+        said: list[str] = []
+
+        async def attempt() -> None:
+            raise DeviceAbsent("nothing answers")
+
+        with pytest.raises(DeviceAbsent):
+            await until_open(attempt, patience(), lambda trouble: said.append(str(trouble)))
+        return said
+
+    assert run(work()) == told
 
 
 def test_units_that_are_all_lost_are_all_given_up() -> None:

@@ -175,6 +175,6 @@ async def test_a_boot_up_message_ends_the_stream_at_once(opened: list[Played], b
     assert len(await coming) == 1
     opened[0].waiting.put([frame(5, 1), Frame(BEGUN_NS, 0x705, 0, b"\x00")])
     assert len(await anext(stream)) == 1, "what came before it is still given"
-    with pytest.raises(DeviceRestarted, match=r"^node 5 on socketcan can0 has restarted: it sent its boot-up message$"):
+    with pytest.raises(DeviceRestarted, match=r"^a unit at node 5 on socketcan can0 has started"):
         await anext(stream)
     await device.close()
