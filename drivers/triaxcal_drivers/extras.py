@@ -8,7 +8,6 @@ from collections.abc import Iterable
 EXTRAS = {
     "can": "can",
     "canopen": "can",
-    "cantools": "can",
     "pymodbus": "modbus",
     "serial": "modbus",
     "msgpack": "station",

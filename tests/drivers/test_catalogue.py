@@ -123,6 +123,16 @@ def test_a_driver_whose_packages_are_not_there_is_listed_with_what_brings_them(e
     ]
 
 
+@pytest.mark.parametrize(
+    ("driver", "opens"), [("can", "triaxcal_drivers.can.device"), ("modbus", "triaxcal_drivers.modbus.device")]
+)
+def test_a_driver_names_no_package_that_opening_a_device_does_not_import(elsewhere, driver, opens):
+    said = elsewhere.python(f"import sys, {opens}; print(*sys.modules)")
+    named = driver_named(driver).packages
+    assert set(named) <= set(said.split())
+    assert named
+
+
 @pytest.mark.slow
 def test_asking_for_one_driver_imports_no_other(elsewhere):
     elsewhere("their_drivers", "raise RuntimeError", "their-serial = their_drivers:SerialDriver")

@@ -16,7 +16,7 @@ def without(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("without")
 @pytest.mark.parametrize(
-    ("modules", "extra"), [(("can", "cantools"), "can"), (("pymodbus",), "modbus"), (("can", "pymodbus"), "station")]
+    ("modules", "extra"), [(("can", "canopen"), "can"), (("pymodbus",), "modbus"), (("can", "pymodbus"), "station")]
 )
 def test_one_extra_brings_all_that_is_missing(modules: tuple[str, ...], extra: str) -> None:
     assert f"pip install 'triaxcal[{extra}]' brings it" in str(absent(modules))

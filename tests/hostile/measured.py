@@ -21,7 +21,7 @@ DEADLINE_S = 60  # of processor time; a command that takes so long is ended by t
 
 
 PACKAGES = ("triaxcal", "triaxcal_drivers", "triaxcald")
-FURTHER = ("cantools", "canopen", "pyarrow.csv", "pyarrow.parquet")  # what is not imported before it is needed
+FURTHER = ("canopen", "pyarrow.csv", "pyarrow.parquet")  # what is not imported before it is needed
 
 
 def main() -> None:

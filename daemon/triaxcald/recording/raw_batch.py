@@ -1,24 +1,23 @@
 """A batch of raw records as a message, column by column.
 
-Through protobuf's own classes every number becomes a Python object first, which
-takes longer than all else that is done to a record; so its wire format is
-written and read here.
+Through the message as recordings declare it every number becomes a Python
+object first, which takes longer than all else that is done to a record; so it
+is written and read by `schema.RAW_COLUMNS`, in which a column is bytes.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import schema
 
-_FIXED64, _LENGTH = 1, 2  # wire types
-_U64 = struct.Struct("<Q")
 _STEP_MOST_NS = 2**31 - 1
 
 
@@ -37,9 +36,9 @@ class Fields(NamedTuple):
     step_ns: bytes = b""
 
 
-_NAMES = dict(enumerate(Fields._fields, start=1))
-_WORDS = frozenset(("first", "start_ns"))
-_WIDTHS: Mapping[str, int] = {"time_ns": 8, "source": 4, "length": 4, "step_ns": 4}
+_values = attrgetter(*Fields._fields)
+_COLUMNS: Mapping[str, str] = {"time_ns": "<u8", "source": "<u4", "length": "<u4", "step_ns": "<i4"}
+_WIDTHS = {name: np.dtype(kind).itemsize for name, kind in _COLUMNS.items()}
 
 
 def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
@@ -56,19 +55,18 @@ def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
         start_ns, step_ns = int(batch.time_ns[0]), step.astype("<i4").tobytes()
     else:
         time_ns = batch.time_ns.astype("<u8").tobytes()
-    return pack(
-        Fields(
-            first=first,
-            phase=phase.encode(),
-            time_ns=time_ns,
-            source=batch.source.astype("<u4").tobytes(),
-            flags=batch.flags.tobytes(),
-            length=batch.length.astype("<u4").tobytes(),
-            payload=batch.payload,
-            start_ns=start_ns,
-            step_ns=step_ns,
-        )
+    message = schema.RAW_COLUMNS(
+        first=first,
+        phase=phase.encode(),
+        time_ns=time_ns,
+        source=batch.source.astype("<u4").tobytes(),
+        flags=batch.flags.tobytes(),
+        length=batch.length.astype("<u4").tobytes(),
+        payload=batch.payload,
+        start_ns=start_ns,
+        step_ns=step_ns,
     )
+    return bytes(message.SerializeToString())
 
 
 def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
@@ -80,7 +78,19 @@ def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
 
 def fields_of(data: bytes) -> Fields:
     """Raises ValueError where ``data`` is no message."""
-    return unpack(data) or _by_protobuf(data)
+    try:
+        message = schema.RAW_COLUMNS.FromString(data)
+    except DecodeError as e:
+        raise ValueError("not a message RawBatch") from e
+    message.DiscardUnknownFields()
+    fields = Fields._make(_values(message))
+    # What another writer may make of the same has another size: a field given
+    # twice or with nothing in it, a column not packed, a field of a later
+    # version.
+    ours = message.ByteSize() == len(data)
+    if ours and not any(len(getattr(fields, name)) % width for name, width in _WIDTHS.items()):
+        return fields
+    return _of_another_writer(data)
 
 
 def batch_of(messages: Sequence[Fields]) -> RawBatch:
@@ -134,12 +144,10 @@ def _times_ns(fields: Fields) -> NDArray[np.int64]:
     return np.cumsum(np.concatenate((start, steps)))
 
 
-def _by_protobuf(data: bytes) -> Fields:
-    """By protobuf's own reader, of a message that another writer made. Raises
-    ValueError."""
+def _of_another_writer(data: bytes) -> Fields:
+    """By the message as recordings declare it. Raises ValueError."""
     message = schema.parse("RawBatch", data)
-    widths = {"time_ns": "<u8", "source": "<u4", "length": "<u4", "step_ns": "<i4"}
-    columns = {name: np.array(getattr(message, name), dtype=kind).tobytes() for name, kind in widths.items()}
+    columns = {name: np.array(getattr(message, name), dtype=kind).tobytes() for name, kind in _COLUMNS.items()}
     return Fields(
         first=message.first,
         phase=message.phase.encode(),
@@ -148,64 +156,3 @@ def _by_protobuf(data: bytes) -> Fields:
         start_ns=message.start_ns,
         **columns,
     )
-
-
-def pack(fields: Fields) -> bytes:
-    """As protobuf writes it: in the order of the fields, without those that are
-    empty."""
-    parts: list[bytes] = []
-    for number, name in _NAMES.items():
-        value: int | bytes = getattr(fields, name)
-        if not value:
-            continue
-        if isinstance(value, int):
-            parts += bytes([number << 3 | _FIXED64]), _U64.pack(value)
-        else:
-            parts += bytes([number << 3 | _LENGTH]), _varint(len(value)), value
-    return b"".join(parts)
-
-
-def unpack(data: bytes) -> Fields | None:
-    """None where ``data`` is written in another way than `pack` does it; it may
-    be a message all the same."""
-    found: dict[str, int | bytes] = {}
-    at, end = 0, len(data)
-    while at < end:
-        tag, at = data[at], at + 1
-        name = _NAMES.get(tag >> 3)
-        if name is None or name in found or tag & 7 != (_FIXED64 if name in _WORDS else _LENGTH):
-            return None
-        if name in _WORDS:
-            if at + _U64.size > end:
-                return None
-            (found[name],) = _U64.unpack_from(data, at)
-            at += _U64.size
-            continue
-        length, at = _length(data, at)
-        if length < 0 or at + length > end or length % _WIDTHS.get(name, 1):
-            return None
-        found[name] = data[at : at + length]
-        at += length
-    return Fields(**found)  # type: ignore[arg-type]  # which of them are numbers is known by name
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
-def _length(data: bytes, at: int) -> tuple[int, int]:
-    """A varint of at most 5 bytes, and where it ends; -1 where there is none."""
-    value = 0
-    for shift in range(0, 35, 7):
-        if at >= len(data):
-            break
-        octet, at = data[at], at + 1
-        value |= (octet & 0x7F) << shift
-        if octet < 0x80:
-            return value, at
-    return -1, at

@@ -160,6 +160,16 @@ def _schema(name: str, fields: Sequence[_Field]) -> Schema:
 
 SCHEMAS: Mapping[str, Schema] = {name: _schema(name, fields) for name, fields in _MESSAGES.items()}
 
+# The class of RawBatch in which packed columns, and the phase, are bytes: these
+# are the same on the wire. Recordings declare the other.
+RAW_COLUMNS: Any = _schema(
+    "RawBatch",
+    [
+        (name, _F.TYPE_BYTES if repeated or kind == _F.TYPE_STRING else kind, False)
+        for name, kind, repeated in _MESSAGES["RawBatch"]
+    ],
+).message
+
 # (topic, message) in the order of their ids, which start at 1; the preview's
 # schema differs per recording.
 CHANNELS: Sequence[tuple[str, str]] = (

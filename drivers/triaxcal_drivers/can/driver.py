@@ -29,7 +29,7 @@ class CanDriver:
 
     profile_model = CanProfile
     bus_model = CanBus
-    packages = ("can", "canopen", "cantools")
+    packages = ("can", "canopen")
 
     def device(self, bundle: Bundle, bus: CanBus) -> CanDevice:
         """Raises ProfileError where the profile's files do not hold what it

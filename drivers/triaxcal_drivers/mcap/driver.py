@@ -20,7 +20,6 @@ class McapDriver:
 
     profile_model = McapProfile
     bus_model = McapBus
-    packages = ("rosbags",)
 
     def device(self, bundle: Bundle, bus: McapBus) -> Device:
         """Raises ProfileError: there is none."""

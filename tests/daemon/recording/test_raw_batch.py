@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import batch_of, decode_raw, encode_raw, fields_of
+from triaxcald.recording.raw_batch import Fields, batch_of, decode_raw, encode_raw, fields_of
 
 TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
 
@@ -78,6 +78,59 @@ def test_a_message_in_another_order_or_with_a_field_of_a_later_version_is_read_t
         first, phase, batch = decode_raw(other)
         assert (first, phase, batch.payload) == (7, "calibration", TWO.payload)
         assert batch.time_ns.tolist() == [256, 512]
+
+
+def by_declaration(data: bytes) -> Fields | None:
+    """As the message says that recordings declare; None where ``data`` is none."""
+    try:
+        message = schema.parse("RawBatch", data)
+    except ValueError:
+        return None
+    kinds = {"time_ns": "<u8", "source": "<u4", "length": "<u4", "step_ns": "<i4"}
+    columns = {name: np.array(getattr(message, name), dtype=kind).tobytes() for name, kind in kinds.items()}
+    return Fields(message.first, message.phase.encode(), flags=message.flags, payload=message.payload,
+                  start_ns=message.start_ns, **columns)  # fmt: skip
+
+
+def as_read(data: bytes) -> Fields | None:
+    try:
+        fields = fields_of(data)
+        fields.phase.decode()
+    except ValueError:
+        return None
+    return fields
+
+
+@pytest.mark.parametrize("phase", ["calibration", "bus/0"])
+@pytest.mark.parametrize(
+    "other",
+    [
+        b"\x09" + bytes(8),  # a number that is 0
+        b"\x12\0",  # an empty phase
+        b"\x12\x01\xff",  # a phase that is no text
+        b"\x19" + bytes(8),  # a time, not packed
+        b"\x1a\x08" + bytes(8),  # times once more
+        b"\x25" + bytes(4),  # a source, not packed
+        b"\x4a\x03abc",  # three bytes of steps
+        b"\x4a\x84\x00abcd",  # a length in more bytes than it takes
+        b"\x52\x01x",  # a field of a later version
+        b"\x53\x54",  # a group, which is none of ours either
+        encode_raw(9, "calibration", TWO),
+    ],
+)
+def test_what_another_writer_may_put_into_a_message_is_read_as_it_is_declared(phase: str, other: bytes) -> None:
+    data = encode_raw(7, phase, TWO)
+    for changed in (data, data + other, other + data, data[:9] + other + data[9:], other):
+        assert as_read(changed) == by_declaration(changed)
+
+
+@given(st.sampled_from(["calibration", "bus/0"]), rows, st.integers(0, 80), st.binary(max_size=4), st.booleans())
+def test_a_damaged_message_is_read_as_it_is_declared(
+    phase: str, records: list[tuple[int, int, int, bytes]], at: int, put: bytes, instead: bool
+) -> None:
+    data = encode_raw(7, phase, RawBatch.of(records))
+    for changed in (data[:at] + put + data[at + instead * len(put) :], data[:at]):
+        assert as_read(changed) == by_declaration(changed)
 
 
 @pytest.mark.parametrize(

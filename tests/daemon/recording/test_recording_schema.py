@@ -51,6 +51,25 @@ def test_the_raw_digest_sees_a_byte_that_moves_from_one_record_to_the_next() -> 
     assert hexdigest(b"ab", b"c") != hexdigest(b"a", b"bc")
 
 
+def test_recordings_declare_the_columns_of_a_raw_batch_as_numbers() -> None:
+    fields = (
+        b"\x12\x0d\x0a\x05first\x18\x01\x20\x01\x28\x06"  # field 1, optional, fixed64
+        b"\x12\x0d\x0a\x05phase\x18\x02\x20\x01\x28\x09"  # string
+        b"\x12\x0f\x0a\x07time_ns\x18\x03\x20\x03\x28\x06"  # repeated fixed64
+        b"\x12\x0e\x0a\x06source\x18\x04\x20\x03\x28\x07"  # repeated fixed32
+        b"\x12\x0d\x0a\x05flags\x18\x05\x20\x01\x28\x0c"  # bytes
+        b"\x12\x0e\x0a\x06length\x18\x06\x20\x03\x28\x07"
+        b"\x12\x0f\x0a\x07payload\x18\x07\x20\x01\x28\x0c"
+        b"\x12\x10\x0a\x08start_ns\x18\x08\x20\x01\x28\x06"
+        b"\x12\x0f\x0a\x07step_ns\x18\x09\x20\x03\x28\x0f"  # repeated sfixed32
+    )
+    file = (
+        b"\x0a\x24triaxcal/recording/v1/rawbatch.proto\x12\x15triaxcal.recording.v1"
+        b"\x22\x9c\x01\x0a\x08RawBatch" + fields + b"\x62\x06proto3"
+    )
+    assert schema.SCHEMAS["RawBatch"].data == b"\x0a\xe4\x01" + file
+
+
 def test_each_auxiliary_channel_is_a_plain_field_of_the_preview() -> None:
     names = ["temp_c", "supply.v", "supply v", "x", "3rd", "größe"]
     assert schema.preview_fields(names) == ["temp_c", "supply_v", "supply_v_", "x_", "_3rd", "gr__e"]
