@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
+from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Residual
 from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.findings import Findings, Unexplained
@@ -54,6 +55,12 @@ def lines(
     )
 
 
+def _corrects(weights: Mapping[str, float]) -> str:
+    if Empirical().name in weights:
+        return "is a smooth function of the direction, the mean over all that may act"
+    return f"averages over {_each(weights)}"
+
+
 def _each(weights: Mapping[str, float]) -> str:
     each = ", ".join(f"{name} ({chance(p)})" for name, p in weights.items())
     return f"what may act, each by its probability: {each}"
@@ -78,7 +85,7 @@ def cause(
     as they are probable, and named nowhere else."""
     said = [*_causes(found, findings, candidates, began, small)]
     also = " also" if findings or candidates else ""
-    mean = [f"the correction{also} averages over {_each(weights)}"] if weights else []
+    mean = [f"the correction{also} {_corrects(weights)}"] if weights else []
     return "; ".join([*(said or [_nothing_named(found, probabilities, weights)]), *mean])
 
 
@@ -162,7 +169,7 @@ def errors(
 ) -> str:
     """The errors before and after in the same poses, what tells most first, and
     how uncertain |a| is in which readings."""
-    how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
+    how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured between these recordings"}[following.source]
     start = small.in_full(following.start_to_start)
     expanded = ", ".join(f"{name} {small.in_full(value)}" for name, value in scopes.named.items())
     said = []

@@ -4,10 +4,12 @@ axes, and what it shows."""
 from __future__ import annotations
 
 from triaxcal.effects.contract import BEFORE, CHANGE, RUN, SCATTER, SINCE_START, TIME, channel_of, lag_in, rate_of
+from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.in_run import runs_named
 from triaxcal.evidence.partial_residuals import POSE, PREDICTED, READINGS, Quantity, Trace, unit_of
 from triaxcal.units import ErrorUnit, in_units_of
 
+SMOOTH = Empirical().name
 OF_AN_AXIS = {
     READINGS: "reading along {axis}",
     BEFORE: "reading along {axis} in the pose before",
@@ -25,6 +27,8 @@ OTHERS = {
 
 def effect_title(effect: str) -> str:
     """`channel_bias:supply_v` becomes `Channel bias: supply_v`."""
+    if effect == SMOOTH:
+        return "Smooth function of the direction"
     name, _, channel = effect.partition(":")
     title = name.replace("_order_", "-order ").replace("_", " ").capitalize()
     return f"{title}: {channel}" if channel else title
@@ -32,7 +36,9 @@ def effect_title(effect: str) -> str:
 
 def title(trace: Trace) -> str:
     """What the panel is of."""
-    on = f", axis {trace.axis}" if trace.axis else f", {', '.join(trace.coefficients)}" if trace.coefficients else ""
+    every = trace.effect == SMOOTH  # dozens of coefficients, which mean nothing one by one
+    listed = ", ".join(() if every else trace.coefficients)
+    on = f", axis {trace.axis}" if trace.axis else f", {listed}" if listed else ""
     runs = runs_named(trace.coefficients) if trace.variable != RUN else ()
     on += "".join(f", recording {run + 1}" for run in runs)
     if trace.effect:

@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from triaxcal.text.traces import SMOOTH
 from triaxcald.remarks import assumption
 from triaxcald.report import figures
 from triaxcald.report.before_after import before_after
@@ -60,6 +61,7 @@ def render_report(
     return _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
+        smooth=SMOOTH,
         unit=unit,
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None, final_word(papers)),
         uncertainty=uncertainty,

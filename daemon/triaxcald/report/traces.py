@@ -124,6 +124,8 @@ def _caption(trace: Trace, outcome: Outcome) -> str:
         return _of_residuals(outcome)
     if trace.share is not None:
         return f"A smooth curve takes away {100 * max(trace.share, 0.0):.0f} % of the weighted residual (adjusted)"
+    if trace.effect == words.SMOOTH:
+        return "The mean over all that may act, as a function of the direction"
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
     if finding is None:
         return f"Probability {chance(outcome.averaged.get(trace.effect))}, and corrected by as much"

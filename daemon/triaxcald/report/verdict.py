@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
+from triaxcal.text.traces import SMOOTH
 from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
@@ -193,6 +194,11 @@ def _found(outcome: Outcome) -> str:
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
+    if not outcome.findings and SMOOTH in outcome.averaged:
+        return (
+            "Something acts that no effect describes. "
+            "The correction is a smooth function of the direction, the mean over all that may act. "
+        )
     if not outcome.findings and outcome.averaged:
         each = ", ".join(f"{effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items())
         return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
