@@ -22,7 +22,7 @@ from triaxcal.evidence.corrected_calibration import corrected
 from triaxcal.evidence.findings import Findings, Named, findings, stated
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.information_gain import Advice, advice, decided
-from triaxcal.evidence.model_average import Refusal, average, refusal
+from triaxcal.evidence.model_average import Refusal, average
 from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
@@ -224,11 +224,9 @@ def diagnose(
     effects = considered(poses, catalogue)
     faulty = faults_of(posterior.evidence.rows, effects)
     hidden = not_identifiable(posterior.evidence, [e for e in effects if e.name not in faulty])
-    found, refused = findings(posterior), refusal(posterior)
-    after = corrected(before, posterior, moment, any_certain=bool(found.named))
+    found = findings(posterior)
+    after, refused = corrected(before, posterior, moment)
     before, after = (c.with_blind_to(tuple(hidden)) for c in (before, after))
-    if refused is None and found.candidates and not after.sensor.effects:
-        refused = Refusal.GAIN
     report = _Report(posterior, moment, after, found)
     sound_check = None if check is None else [p for p in check if not p.fault]
     return Loop(

@@ -14,7 +14,7 @@ from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
 from triaxcal.estimate.likelihood import State, linearise
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.mixture_components import components
-from triaxcal.evidence.model_average import Average, least_loss
+from triaxcal.evidence.model_average import Average, Refusal, least_loss
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.shape_posterior import shapes_of
 from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
@@ -22,12 +22,12 @@ from triaxcal.uncertainty.extrapolation import extrapolated
 from triaxcal.uncertainty.propagation import gain_given_prior
 
 
-def corrected(before: Calibration, posterior: Posterior, at: HoldsAt, *, any_certain: bool) -> Calibration:
-    """With the likely effects at their mean coefficients. ``before`` is the
-    linear calibration of all poses that were given: where no effect is to be
-    corrected (`least_loss`), it stays, with the errors that all likely sets make
-    of it."""
-    model_average = least_loss(posterior, at, before.sensor, components(posterior), any_certain=any_certain)
+def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> tuple[Calibration, Refusal | None]:
+    """The calibration with the likely effects at their mean coefficients, and
+    why no name is corrected in it. ``before`` is the linear calibration of all
+    poses that were given: where no effect is to be corrected (`least_loss`), it
+    stays, with the errors that all likely sets make of it."""
+    model_average, refused = least_loss(posterior, at, before.sensor, components(posterior))
     rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in model_average.sensor.effects for name in effect.needs)
     after = replace(
@@ -51,10 +51,10 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt, *, any_cer
         linear_only=before if model_average.sensor.effects else None,
     )
     if not model_average.sensor.effects:
-        return after
+        return after, refused
     beyond = extrapolated(after)
     after = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
-    return _with_residuals(after, rows, model_average)
+    return _with_residuals(after, rows, model_average), refused
 
 
 def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, float]:

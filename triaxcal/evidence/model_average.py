@@ -99,23 +99,27 @@ def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | N
 
 
 def least_loss(
-    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components], *, any_certain: bool
-) -> Average:
-    """What is handed on: of the ``linear`` sensor and the averages that the
-    posterior allows (`refusal`) the one with the least expected error.
-    ``any_certain`` where some name, or one of a group of names, certainly acts:
-    its correction needs no gain."""
+    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]
+) -> tuple[Average, Refusal | None]:
+    """What is handed on, and why no name is corrected in it. Of the ``linear``
+    sensor and the averages that the posterior allows (`refusal`), it is the one
+    with the least expected error. Names none of which is certain are corrected
+    only where the expected mean square falls far enough (`Odds.gain_by_names`)."""
+    odds = posterior.evidence.odds
     sphere = OverSphere.of(posterior, at, mixture)
     alone = _linear_alone(posterior, at, linear, mixture, sphere)
     why = refusal(posterior)
     if why is None:
         made = _of_likely(posterior, sphere, at, mixture)
-        pays = any_certain or made.loss <= posterior.evidence.odds.gain_by_names * alone.loss
-        return made if made.sensor.effects and pays else alone
+        pays = bool(posterior.certain) or made.loss <= odds.gain_by_names * alone.loss
+        if made.sensor.effects and pays:
+            return made, None
+        likely = any(reaches(p, odds.reported) for p in posterior.effect_probabilities.values())
+        return alone, Refusal.GAIN if likely else None
     if why is not Refusal.UNMODELLED:
-        return alone
+        return alone, why
     whole = _smooth(posterior, sphere, at, linear, mixture)
-    return whole if whole.loss <= posterior.evidence.odds.gain * alone.loss else alone
+    return (whole if whole.loss <= odds.gain * alone.loss else alone), why
 
 
 def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mixture: Sequence[Components]) -> Average:

@@ -26,7 +26,7 @@ START = HoldsAt(Moment.SECONDS, 0.0, 0.0)
 
 def of(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> tuple[Calibration, Calibration]:
     before = fit(poses, signs=signs)
-    return before, corrected(before, posterior_of(poses, before, signs=signs, catalogue=FEW), START, any_certain=True)
+    return before, corrected(before, posterior_of(poses, before, signs=signs, catalogue=FEW), START)[0]
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
         before = fit(poses, signs=MINUS)
         posterior = posterior_of(poses, before, signs=MINUS, catalogue=FEW)
         inside, after = (
-            corrected(before, posterior, HoldsAt(Moment.SECONDS, t_s, t_s), any_certain=True)
+            corrected(before, posterior, HoldsAt(Moment.SECONDS, t_s, t_s))[0]
             for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
         )
         assert not [c for c in inside.cautions if isinstance(c, Extrapolated)]
