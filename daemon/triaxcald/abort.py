@@ -65,8 +65,7 @@ def abort(reason: str) -> NoReturn:
     standard error."""
     said, code = [reason], INTERRUPTED
     try:
-        for number in STOP_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+        ignore_stop_signals()
         until_s = time.monotonic() + CLOSING_S
         for action in reversed(list(_actions.values())):
             if (left := action(until_s)) is not None:
@@ -75,6 +74,24 @@ def abort(reason: str) -> NoReturn:
         tell(f"triaxcal: {'; '.join(said)}")
     finally:
         os._exit(code)
+
+
+def ignore_stop_signals() -> None:
+    """Ignores stop signals to the end of the process.
+
+    Python reports a signal that came just before as an unraisable `OSError`
+    ("ignored due to race condition"). That report is dropped: the process ends
+    anyway.
+    """
+    report = sys.unraisablehook
+
+    def all_others(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.object is not None or not isinstance(unraisable.exc_value, OSError):
+            report(unraisable)
+
+    sys.unraisablehook = all_others
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def tell(line: str) -> None:

@@ -114,7 +114,7 @@ def test_a_killed_process_loses_at_most_a_second_and_the_rest_can_be_fitted(
     else:
         assert told == []
         assert exported.endswith("none lost\n")
-    triaxcal("audit", mended).failed(2, "missing; the recording holds no result")
+    triaxcal("audit", mended).failed(2, "holds no result to audit")
 
 
 @pytest.mark.slow

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import re
+import json
 from typing import Any
 
 import pytest
 
 from tests.virtual_line import described, virtual_line
+from triaxcal.rounding import concise
 
 FIXTURE = {"poses": 26, "hold_s": 2.0, "move_s": 0.8}
 KNOCKED_S = 31.2
@@ -25,11 +26,13 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
     station = workshop.station({"serial": "4711", "bus": bus}, plan={"poses": 26, "hold_s": 0.6})
     with virtual_line(described(device)):
         done = triaxcal("run", station)
-    said = [line.strip() for line in done.out.splitlines()]
     assert done.code == 0, done.err
+    said = [line.strip() for line in done.out.splitlines()]
     first = next(i for i, line in enumerate(said) if line.startswith("corrected: bias_step (probability ")) + 1
+    (certificate,) = workshop.folder.glob("*.certificate.json")
+    found = json.loads(certificate.read_text())["result"]["calibration"]["effects"]["bias_step"]
     for (name, truth), line in zip(STEP.items(), said[first : first + len(STEP)], strict=True):
-        found = re.fullmatch(rf"{name} (\S+) ± (\S+) .*", line)
-        assert found, line
+        coefficient = found[name]
+        assert line == f"{name} {concise(coefficient['value'], coefficient['standard_error'], coefficient['unit'])}"
         late = START_S if name == "at" else 0.0
-        assert abs(float(found[1]) - truth) < 4 * float(found[2]) + late, line
+        assert abs(coefficient["value"] - truth) < 4 * coefficient["standard_error"] + late

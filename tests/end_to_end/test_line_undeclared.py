@@ -60,8 +60,8 @@ class Finished:
 
     @property
     def likely(self) -> set[str]:
-        """Effects that are likelier than not."""
-        return {name for name, p in self.result["probabilities"].items() if p >= 0.5}
+        """Effects that are likelier than not; of those that are not certain no probability is stated."""
+        return {name for name, p in self.result["probabilities"].items() if p is None or p >= 0.5}
 
     @property
     def standard_error(self) -> dict[str, float]:
@@ -177,7 +177,7 @@ def test_what_a_part_at_fault_does_is_found_written_and_gone_from_the_output_aft
 ) -> None:
     unit = run(*faults, seed=31)
     assert unit.likely == effects
-    assert all(unit.result["probabilities"][effect] > 0.9 for effect in effects)
+    assert all(unit.result["calibration"]["effects"][effect]["weight"] > 0.9 for effect in effects)
     assert unit.result["unexplained"]["significant"] is False
     assert unit.document["outcome"]["device_state"] == "new_verified"
     assert unit.document["exit_code"] == 0

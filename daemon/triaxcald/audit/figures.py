@@ -24,6 +24,9 @@ LINE = 1e-6
 """Of the combined variance: so much the variance of a line in a budget may be
 off, which is a difference of two. A fit to two effects that are hard to tell
 apart makes 1e-8."""
+CORRELATION = 1e-2
+"""The standard uncertainty of a correlation, (1 − ρ²)/√ν, is 0.014 for ρ = 0.95
+and ν = 50."""
 WORDED = 5e-5
 """Of itself: so far a figure may be from the edge between two wordings."""
 _OF_ONE_POSE = ("residual_g", "before_residual_g", "error_g")
@@ -162,6 +165,12 @@ def _stated(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
         yield from ((inside(at, key), of_pose) for key in _OF_ONE_POSE)
     if node.get("expanded_uncertainty_g") and "after_rms_g" in node:
         yield inside(at, "after_rms_g"), node["expanded_uncertainty_g"] / 2
+    if "centre" in node:
+        yield from _of_transformation(node, at)
+    if "correlation" in node:
+        yield from ((place, CORRELATION) for place, _ in _placed(node["correlation"], inside(at, "correlation")))
+    if "significant" in node and node["rms_g"]:  # of what no effect explains: an estimate, known to its own size
+        yield inside(at, "rms_g"), node["rms_g"]
     if "budget" in node:
         yield from _of_lines(node, at)
     if "words" in node and "uncertainty" in node:
@@ -171,6 +180,18 @@ def _stated(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
                 yield f"{inside(at, 'words')}[{i}].wanted", error
     for key, inner in node.items():
         yield from _stated(inner, inside(at, key))
+
+
+def _of_transformation(calibration: Mapping[str, Any], at: str) -> Iterator[tuple[str, float]]:
+    """Of the centre c = K b and the matrix A = (K R)⁻¹, which repeat the
+    parameters in another form: the uncertainty of the parameter that moves each
+    most."""
+    scale, matrix, errors = calibration["scale_factor"], calibration["matrix"], calibration["standard_error"]
+    for i in range(3):
+        yield f"{inside(at, 'centre')}[{i}]", abs(scale[i]) * (errors["bias"][i] or 0.0)
+        yield f"{inside(at, 'matrix')}[{i}][{i}]", abs(matrix[i][i] / scale[i]) * (errors["scale_factor"][i] or 0.0)
+        for j in range(i + 1, 3):  # the angle between axes i and j is that of the third
+            yield f"{inside(at, 'matrix')}[{i}][{j}]", abs(matrix[j][j]) * (errors["misalignment"][3 - i - j] or 0.0)
 
 
 def _of_lines(budget: Mapping[str, Any], at: str) -> Iterator[tuple[str, float]]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
 import threading
 import time
 from typing import NoReturn
 
-from triaxcald.abort import STOP_SIGNALS
+from triaxcald.abort import ignore_stop_signals
 from triaxcald.cli.signals import heed_stop_signals
 from triaxcald.memory import out_of_memory, ran_out_of_memory
 from triaxcald.printable import printable
@@ -70,8 +69,7 @@ def _end(code: int) -> NoReturn:
     """The interpreter's own end gives signals back to the system, which would
     spoil the exit code, and waits for every thread, one that hangs in a bus
     driver or reckons what nobody wants any more too."""
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+    ignore_stop_signals()
     others = [t for t in threading.enumerate() if t is not threading.current_thread() and not t.daemon]
     until_s = time.monotonic() + LAST_THREADS_S
     for thread in others:

@@ -375,3 +375,20 @@ except Interrupted as e:
 """
     done = _python(code)
     assert (done.stdout, done.stderr) == ("interrupted\n", "")
+
+
+UNRAISABLE = """
+from types import SimpleNamespace
+from triaxcald.abort import ignore_stop_signals
+report = lambda unraisable: print(unraisable.exc_value)
+sys.unraisablehook = report
+ignore_stop_signals()
+for error, of in ((OSError("Signal 1 ignored due to race condition"), None), (OSError("disk"), open),
+                  (KeyError(7), None)):
+    sys.unraisablehook(SimpleNamespace(exc_value=error, object=of))
+"""
+
+
+def test_a_signal_that_comes_while_signals_are_switched_off_is_not_reported() -> None:
+    """CPython hands it to `sys.unraisablehook` as an error of no object."""
+    assert _python(UNRAISABLE).stdout == "disk\n7\n"

@@ -166,7 +166,7 @@ def test_fit_says_how_many_of_the_poses_it_left_out(folder: Path, triaxcal: Run)
     fitted = triaxcal("fit", folder / "rail.csv", "--json").json
     left_out = sum(not p["used"] for p in fitted["poses"])
     assert left_out >= 1
-    assert f"26 poses, {left_out} of them left out: residual rms " in triaxcal("fit", folder / "rail.csv").out
+    assert f"26 poses, {left_out} of them left out: " in triaxcal("fit", folder / "rail.csv").out
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: C
     assert done.code == 0
     assert served.unit.eeprom == OLD.image()
     report = _only(workshop.folder, "*.report.html").read_text()
-    assert "<strong>Not judged; nothing found beyond noise</strong>" in report
+    assert "<strong>Not judged; usable: nothing found beyond noise</strong>" in report
     assert "No register was written." in report
     with Recording.open(path) as recording:
         assert all(a.operation == "read" for a in recording.register_accesses())
