@@ -105,11 +105,16 @@ class ErrorPropagation(SphereMean):
 
 def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     """(p,n) of parameters by weighted residuals, where coefficients are held by
-    their ``prior_sd``. Columns are scaled first: those of a temperature and of
-    a cube are decades apart."""
-    norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
-    rows = weighted / norms
-    if spread is not None and len(spread):
-        prior_rows = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
-        rows = np.concatenate([rows, prior_rows / norms])
-    return np.asarray(np.linalg.pinv(rows, rcond=1e-13)[:, : len(weighted)] / norms[:, None])
+    their ``prior_sd``. One of zero spread is fixed: its row is zero."""
+    n, p = weighted.shape
+    held_by = np.full(p, np.inf)
+    if spread is not None:
+        held_by[9 : 9 + len(spread)] = spread
+    free = np.flatnonzero(held_by > 0)
+    # Columns are scaled: those of a temperature and of a cube are decades apart.
+    norms = np.maximum(np.linalg.norm(weighted[:, free], axis=0), 1e-300)
+    prior_rows = np.diag(1 / held_by[free])[np.isfinite(held_by[free])] / norms
+    gain = np.zeros((p, n))
+    gain[free] = np.linalg.pinv(np.concatenate([weighted[:, free] / norms, prior_rows]), rcond=1e-13)[:, :n]
+    gain[free] /= norms[:, None]
+    return gain
