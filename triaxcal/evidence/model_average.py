@@ -118,7 +118,7 @@ def least_loss(
         return alone, Refusal.GAIN if likely else None
     if why is not Refusal.UNMODELLED:
         return alone, why
-    whole = _smooth(posterior, sphere, at, linear, mixture)
+    whole = _smooth(posterior, sphere, at, mixture)
     return (whole if whole.loss <= odds.gain * alone.loss else alone), why
 
 
@@ -145,22 +145,21 @@ def _of_listed(
     return _with_errors(posterior, sphere, at, projection, moved, state, mean, process_bias, mixture)
 
 
-def _smooth(
-    posterior: Posterior, sphere: OverSphere, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]
-) -> Average:
-    """The ``linear`` sensor with the mean of all functions of the direction,
-    and its nine parameters as they come out beside that. Between the poses a
-    function of the direction is interpolated; what a mixture without the truth
-    says of other conditions is not known to hold there."""
+def _smooth(posterior: Posterior, sphere: OverSphere, at: HoldsAt, mixture: Sequence[Components]) -> Average:
+    """The sensor with the mean of all functions of the direction, and the nine
+    parameters that fit the poses best beside it. Between the poses a function
+    of the direction is interpolated. Effects of temperature, time or memory are
+    left out: if none of the hypotheses is true, nothing says that they hold
+    under other conditions."""
     rows = posterior.evidence.rows
     projection = Projection.of(posterior, at, [e for e in _likeliest(posterior) if not e.needs])
     coefficients = _mean(posterior, projection)[0][LINEAR:]
     further = smooth_mean(posterior, mixture, projection, sphere)
     projection, coefficients = projection.beside(posterior, sphere.smooth), np.concatenate([coefficients, further])
     used = np.flatnonzero(posterior.outlier_probabilities < posterior.evidence.odds.reported)
-    taken = np.linalg.lstsq(rows.linear[used], (projection.columns @ coefficients)[used], rcond=None)[0]
-    alone = State.of(rows.problem, linear).theta - rows.state.theta
-    mean = np.concatenate([alone - taken / rows.lengths, coefficients])
+    left = (rows.y - projection.columns @ coefficients)[used]
+    nine = np.linalg.lstsq(rows.linear[used], left, rcond=None)[0] / rows.lengths
+    mean = np.concatenate([nine, coefficients])
     state = _where_linearised(posterior, mean, projection)
     sensor = state.sensor(rows.problem)
     return _with_errors(posterior, sphere, at, projection, sensor, state, mean, np.zeros(3), mixture)
