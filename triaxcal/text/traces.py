@@ -19,7 +19,7 @@ OF_AN_AXIS = {
 OTHERS = {
     POSE: "pose",
     RUN: "recording",
-    TIME: "time from the middle of the poses",
+    TIME: "time",
     SINCE_START: "time",
     PREDICTED: "contribution by the fit",
 }

@@ -13,8 +13,8 @@ MOST = 8
 
 
 SENTENCES = frozenset({
-    "advice", "apart", "data_quality", "halved_by", "holds", "how", "lead", "not_evaluated", "reason", "remedy",
-    "summary", "warnings",
+    "advice", "apart", "data_quality", "halved_by", "holds", "how", "lead", "not_evaluated", "notes", "reason",
+    "remedy", "summary", "warnings",
 })  # fmt: skip
 """Keys of documents under which English stands: words may be better in another
 version, numbers may not differ."""
