@@ -29,7 +29,7 @@ def _array() -> bytes:
     ("data", "expected"),
     [
         (bytes.fromhex("89 4d 43 41 50 30 0d 0a 01"), "an MCAP file"),
-        (gzip.compress(b"t_s,ux,uy,uz\n"), "a gzip file"),
+        (gzip.compress(b"t_s,ux,uy,uz\n", mtime=0), "a gzip file"),
         (bytes.fromhex("50 41 52 31 15 04 15 00"), "a Parquet file"),
         (_zipped(), "a ZIP file, as spreadsheets are"),
         (_array(), "a NumPy file"),
