@@ -84,6 +84,13 @@ def uncertainty(value: float | None) -> float | None:
     return _as_uncertainty(found) if isinstance(found, Printed) else found
 
 
+def in_standard_errors(value: float | None) -> float | None:
+    """A residual in standard errors, or a mean of such: it is known to about
+    one, however small it is."""
+    found = number(value, UNCERTAINTY_DIGITS)
+    return Printed(found, found.exact, found.step, 1.0) if isinstance(found, Printed) else found
+
+
 def probability(value: float | None) -> float | None:
     return number(value, PROBABILITY_DIGITS)
 

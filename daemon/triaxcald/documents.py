@@ -20,7 +20,7 @@ from triaxcal.interchange.calibration_document import (
     coefficients_document,
     residual_document,
 )
-from triaxcal.rounding import chance, error, known_to, number, numbers, uncertainty
+from triaxcal.rounding import chance, error, in_standard_errors, known_to, number, numbers, uncertainty
 from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import next_recording
@@ -109,7 +109,7 @@ def _trace(trace: Trace, reference: float, reference_unit: str) -> Document:
     widest = float(trace.half_width.max(initial=0.0))
 
     def value(v: float, known: float) -> float | None:
-        return uncertainty(v) if in_errors else known_to(v, known, reference)
+        return in_standard_errors(v) if in_errors else known_to(v, known, reference)
 
     return {
         "effect": trace.effect or None,

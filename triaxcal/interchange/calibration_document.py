@@ -24,6 +24,7 @@ from triaxcal.rounding import (
     correlation,
     direction,
     error,
+    in_standard_errors,
     number,
     numbers,
     probability,
@@ -68,8 +69,8 @@ def residual_document(residual: Residual, reference: float = 1.0) -> Document:
         "cross_validated_rms_g": error(residual.cross_validated_rms_g, reference),
         "noise_floor_g": error(residual.noise_floor_g, reference),
         "lack_of_fit_p": probability(residual.lack_of_fit_p),
-        "weighted_rms": uncertainty(residual.weighted_rms),
-        "reduced_chi2": uncertainty(residual.reduced_chi2),
+        "weighted_rms": in_standard_errors(residual.weighted_rms),
+        "reduced_chi2": in_standard_errors(residual.reduced_chi2),
     }
 
 
@@ -195,7 +196,7 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
         "direction": direction(p.direction),
         "residual_g": error(p.residual_g, reference),
         "standard_error_g": uncertainty(p.standard_error_g),
-        "studentized": uncertainty(p.studentized),
+        "studentized": in_standard_errors(p.studentized),
         "leverage": uncertainty(p.leverage),
         "used": p.used,
         "excluded": p.excluded,
