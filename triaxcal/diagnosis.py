@@ -121,16 +121,18 @@ class Loop:
         """What the poses show of each finding and each candidate, against what
         drives it; where there are none, of the likeliest effects that are
         corrected all the same. Of what has no name, against the variables that
-        tell most of it. Where no effect probably acts, the residuals."""
+        tell most of it, with the first finding in the model. Where the unit or
+        its mounting changed, or no effect probably acts, the residuals."""
         rows = self.posterior.evidence.rows
         names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
         names = names or sorted(self.averaged, key=lambda name: -self.averaged[name])[:SHOWN]
         of_names = [of_effect(rows, self.conditional_on.get(name, self.after), name) for name in names]
         something = self.found.nothing < self.posterior.evidence.odds.reported
-        untold = self.found.unexplained.significant or (something and not names and not self.found.outliers)
-        of_rest = telling_variables(rows, self.after) if untold else ()
+        unnamed = self.found.unexplained.significant or (something and not names and not self.found.outliers)
+        with_finding = self.conditional_on.get(self.findings[0].effect, self.after) if self.findings else self.after
+        of_rest = telling_variables(rows, with_finding) if unnamed and self.found.change_point is None else ()
         found = (*(trace for each in of_names for trace in each), *of_rest)
-        return found or (residuals(self.after),)
+        return (*found, residuals(self.after)) if self.found.change_point or not found else found
 
     @property
     def averaged(self) -> Mapping[str, float]:

@@ -28,7 +28,7 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
         done = triaxcal("run", station)
     assert done.code == 0, done.err
     said = [line.strip() for line in done.out.splitlines()]
-    first = next(i for i, line in enumerate(said) if line.startswith("corrected: bias_step (probability ")) + 1
+    first = next(i for i, line in enumerate(said) if line.startswith("corrected: bias_step (share ")) + 1
     (certificate,) = workshop.folder.glob("*.certificate.json")
     found = json.loads(certificate.read_text())["result"]["calibration"]["effects"]["bias_step"]
     for (name, truth), line in zip(STEP.items(), said[first : first + len(STEP)], strict=True):

@@ -67,18 +67,17 @@ class Odds:
     """Where an unmodelled part is likelier than not, or a name would be
     unlikelier than not without some one pose, no effect is corrected."""
     gain: float = 0.5
-    """Of the expected mean square of |a| under the linear model: where a
-    correction of what no name describes leaves more, it is not made. Half is a
-    margin: the covariances are those of nobody's sensor, and memory or time may
-    look like a function of the direction."""
+    """Of the expected mean square of |a| under the linear model. A correction
+    that no name describes is not made where it leaves more. Half is a margin:
+    no real sensor follows the assumed covariances exactly, and memory or time
+    may look like a function of the direction."""
     gain_by_names: float = 0.7
     """Likewise of a correction by names none of which is certain. Of fifty
     recordings of 14 poses with an effect that no catalogue has, three came out
     worse, by up to five times, and all three expected more than this."""
     another_form: float = 0.2
-    """Of the mean square of what a named function of the force may do across
-    the measured vector, where |a| does not tell how axes share it: that its
-    name is another's."""
+    """Share of the mean square along the measured vector that is added across
+    it, because another effect may look the same in |a|."""
     together: int = 3
     """Effects and outliers at once, at most."""
     relinearise_chi2: float = 1.0

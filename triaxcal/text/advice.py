@@ -30,9 +30,9 @@ GOES_WITH = {
 }
 BY_DIRECTION = " by its name, but the mean over all that may act, as a smooth function of the direction"
 REFUSED = {
-    Refusal.UNMODELLED: "something that no effect describes acts as well",
+    Refusal.UNMODELLED: "something that no known effect describes acts",
     Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
-    Refusal.ONE_POSE: "what was found hangs on a single pose",
+    Refusal.ONE_POSE: "a single pose decides the result",
     Refusal.GAIN: "no name is certain, and the expected error would fall too little",
 }
 
@@ -81,6 +81,8 @@ def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     if loop.refusal is not None:
         yield f"no effect is corrected{BY_DIRECTION if loop.smooth else ''}, because {REFUSED[loop.refusal]}"
     for name, expected in loop.advice.expected.items():
+        if loop.stated[name] is None:  # not calibrated, so what it may become is not either
+            continue
         yield (
             f"{name}: probability {chance(expected.now)} now, {chance(expected.if_it_acts)} expected after the poses "
             "that are advised, if it acts"

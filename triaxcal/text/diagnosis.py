@@ -96,7 +96,7 @@ def _nothing_named(
         shows = "is likely" if weights else "shows"
         return f"no effect {shows} (nothing acts with probability {chance(found.nothing)})"
     names = [likely(name, p) for name, p in probabilities.items()][:LIKELIEST]
-    none = f"something that no effect describes ({chance(found.unexplained.probability)})"
+    none = f"something that no known effect describes ({chance(found.unexplained.probability)})"
     return f"something acts, and these poses do not tell what; the likeliest are {', '.join(names)}; or {none}"
 
 
@@ -116,8 +116,8 @@ def _causes(
     for finding in findings:
         yield f"{_named(finding)} acts"
     for candidate in candidates:
-        one_pose = ", but less so without some one pose" if candidate.hangs_on_one_pose else ""
-        yield f"{candidate.effect} probably acts, if the catalogue has what acts{one_pose}"
+        one_pose = ", and a single pose decides it" if candidate.hangs_on_one_pose else ""
+        yield f"{candidate.effect} probably acts, if the cause is one of the effects that were looked for{one_pose}"
     if found.unexplained.significant:
         yield unexplained(found.unexplained, small)
     if found.outliers:
@@ -141,7 +141,7 @@ def unexplained(part: Unexplained, small: ErrorUnit) -> str:
     """What no effect of the catalogue describes."""
     with_what = f"; it goes with {GOES_WITH[part.kind]}" if part.kind in GOES_WITH else ""
     return (
-        f"something acts that no effect describes (probability {chance(part.probability)}), "
+        f"something acts that no known effect describes (probability {chance(part.probability)}), "
         f"{small.in_full(part.rms_g)} rms{with_what}"
     )
 

@@ -128,7 +128,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         each = ", ".join(f"{name} ({of_diagnosis.chance(p)})" for name, p in rest.items())
         show(f"  corrected as far as it is probable: {each}")
     for effect in likely:
-        show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(weights[effect.name])})")
+        show(f"  corrected: {effect.name} (share {of_diagnosis.chance(weights[effect.name])})")
         for name, (value, error, unit) in c.coefficients_of(effect.name).items():
             show(f"    {name} {concise(value, error, unit)}")
     if o.provisioned:

@@ -22,8 +22,8 @@ ERASE = "\r\x1b[K"
 WORDS = {
     Stage.POSES: "looking for still spans",
     Stage.FIT: "fitting the linear model",
-    Stage.EFFECTS: "weighing what may act",
-    Stage.ERRORS: "reckoning errors",
+    Stage.EFFECTS: "comparing possible effects",
+    Stage.ERRORS: "computing uncertainties",
     Stage.ADVICE: "looking for the poses that tell most",
 }
 

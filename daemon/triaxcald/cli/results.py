@@ -144,7 +144,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     told = loop.stated
     likely = [[name, chance_of(told[name])] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", diagnosis.chance(loop.found.nothing)]]
-    rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
+    rest += [["something that no known effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
     table("what acts", ["", "probability"], [*likely, *rest])
     for finding in loop.findings:
         show(f"{finding.verdict}: {finding.effect} ({diagnosis.reason(finding, loop.refusal)})")

@@ -123,7 +123,7 @@ def _caption(trace: Trace, outcome: Outcome) -> str:
     if trace.quantity is Quantity.STANDARD_ERRORS:
         return _of_residuals(outcome)
     if trace.share is not None:
-        return f"A smooth curve takes away {100 * max(trace.share, 0.0):.0f} % of the weighted residual (adjusted)"
+        return f"Smooth curves on three axes take away {100 * max(trace.share, 0.0):.0f} % (adjusted)"
     if trace.effect == words.SMOOTH:
         return "The mean over all that may act, as a function of the direction"
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)

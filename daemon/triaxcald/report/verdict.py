@@ -22,7 +22,7 @@ Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
 _NO_LIMIT = "No limit was declared; the verdict compares with the noise floor alone."
 _WHAT_IS_LEFT = {
-    True: "something probably acts that no effect describes",
+    True: "something acts that no known effect describes",
     False: "more is left than the noise of the poses accounts for",
 }
 """Of a search for effects, and of a fit."""
@@ -196,7 +196,7 @@ def _found(outcome: Outcome) -> str:
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
     if not outcome.findings and SMOOTH in outcome.averaged:
         return (
-            "Something acts that no effect describes. "
+            "Something acts that no known effect describes. "
             "The correction is a smooth function of the direction, the mean over all that may act. "
         )
     if not outcome.findings and outcome.averaged:

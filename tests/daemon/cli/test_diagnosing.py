@@ -165,7 +165,7 @@ def test_no_probability_is_said_to_be_nothing_or_certainty_and_no_error_has_an_e
 ) -> None:
     said = "".join(asked("diagnose", recording, "--verbose").out for recording in (rippled, settling))
     assert "lack of fit p < 1e-12" in said
-    assert cells(said, "something that no effect describes")[1] == "more than 0.999"
+    assert cells(said, "something that no known effect describes")[1] == "more than 0.999"
     assert cells(said, "nothing")[1] == "less than 0.001"
     assert not re.search(r"(p|probability|\() ?[01](?![.\d])|e[+-]\d+ µg", said)
 
@@ -204,7 +204,7 @@ def test_what_no_effect_describes_is_told_with_its_probability_and_nothing_is_co
     part = document["unexplained"]
     assert part["significant"]
     assert part["probability"] >= 0.99
-    assert part["lead"].startswith("something acts that no effect describes (probability more than 0.999), ")
+    assert part["lead"].startswith("something acts that no known effect describes (probability more than 0.999), ")
     assert f" {ErrorUnit().in_full(part['rms_g'])} rms; it goes with " in part["lead"]
     assert document["summary"][:2] == ["investigate", part["lead"]]
     assert (document["findings"], document["candidates"], document["not_corrected"]) == ([], [], "unmodelled")

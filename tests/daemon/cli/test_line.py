@@ -44,7 +44,7 @@ def test_what_is_corrected_is_told_with_its_probability_and_its_coefficients(
 ) -> None:
     said = shown(loop, capsys)
     ((effect, _),) = loop.after.sensor.effects
-    assert f"corrected: {effect.name} (probability {loop.after.weights[effect.name]:.2g})" in said
+    assert f"corrected: {effect.name} (share {loop.after.weights[effect.name]:.2g})" in said
     for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
         assert error is not None
         assert f"{name} {concise(value, error, unit)}" in said

@@ -220,15 +220,15 @@ def test_two_effects_are_corrected_at_once_in_pictures_above_the_channels_that_m
 
 
 def test_what_no_effect_describes_is_told_in_the_words_of_the_document(words: dict[str, Any]) -> None:
-    lead = f"something acts that no effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}"
+    lead = f"something acts that no known effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}"
     words["unexplained"] = {"significant": True, "probability": 0.98, "kind": "time", "rms_g": 2.81e-4, "lead": lead}
     html, text = page(words)
     assert 'class="verdict unexplained"' in html
-    assert "Something probably acts that no effect describes." in text
-    assert f"Something acts that no effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}." in text
+    assert "Something acts that no known effect describes." in text
+    assert f"Something acts that no known effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}." in text
     assert text.count(HOSTILE) == 1
     words["unexplained"]["lead"] = None
-    assert "Something probably acts that no effect describes, 281 µg rms." in page(words)[1]
+    assert "Something acts that no known effect describes, 281 µg rms." in page(words)[1]
 
 
 def test_how_large_it_is_is_told_only_where_something_probably_acts_that_no_effect_describes(
@@ -236,7 +236,7 @@ def test_how_large_it_is_is_told_only_where_something_probably_acts_that_no_effe
 ) -> None:
     words["unexplained"] = {"significant": False, "probability": 0.043, "rms_g": 2.81e-6, "lead": ""}
     _, text = page(words)
-    assert "Nothing that no effect describes shows; its probability is 0.043." in text
+    assert "No unexplained error is visible; one exists with probability 0.043." in text
     assert "2.81" not in text
 
 
@@ -321,13 +321,13 @@ def test_an_outlier_beside_what_no_effect_describes_is_to_be_taken_again(bare: d
 def test_an_effect_that_is_known_and_not_corrected_is_in_question_no_more_than_its_name(bare: dict[str, Any]) -> None:
     bare["findings"] = [
         {"effect": "bias_drift", "verdict": "confounded", "probability": 0.997, "coefficients": {}, "alternatives": [],
-         "reason": "it acts with probability 0.997; not corrected, because what was found hangs on a single pose",
+         "reason": "it acts with probability 0.997; not corrected, because a single pose decides the result",
          "remedy": ""}
     ]  # fmt: skip
     html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert "Effect found, cause uncertain" in text
-    assert "not corrected, because what was found hangs on a single pose." in text
+    assert "not corrected, because a single pose decides the result." in text
     assert "Probability 0.997 Or instead none" in text
     assert "it is not certain that this effect acts" not in text
     assert "Who corrects it Nobody: it is not in the model" in text

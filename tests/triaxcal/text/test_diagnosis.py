@@ -47,19 +47,19 @@ def test_the_cause_is_told_with_its_probability() -> None:
     assert cause(NOTHING) == "no effect shows (nothing acts with probability 0.91)"
     assert cause(replace(NOTHING, nothing=0.02)).startswith(
         "something acts, and these poses do not tell what; the likeliest are warm_up (0.46), bias_drift (0.41), "
-        "hysteresis (0.1); or something that no effect describes ("
+        "hysteresis (0.1); or something that no known effect describes ("
     )
     assert cause(NOTHING, (KNOWN,)) == "hysteresis (more than 0.999) acts"
     assert cause(NOTHING, (GROUP,)) == "one of warm_up, bias_drift (0.28) acts"
     likely = Candidate("third_order_nonlinearity", None, {})
     assert "; third_order_nonlinearity probably acts" in cause(NOTHING, (KNOWN,), (likely,))
     hangs = Candidate("hysteresis", None, {}, hangs_on_one_pose=True)
-    assert cause(NOTHING, (), (hangs,)).endswith("but less so without some one pose")
+    assert cause(NOTHING, (), (hangs,)).endswith("and a single pose decides it")
 
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
     found = replace(NOTHING, unexplained=Unexplained(0.97, UnmodelledKind.POSE_BEFORE, 240e-6, True))
-    said = "something acts that no effect describes (probability 0.97), 240 µg rms; it goes with the pose before"
+    said = "something acts that no known effect describes (probability 0.97), 240 µg rms; it goes with the pose before"
     assert cause(found) == said
 
 
@@ -77,7 +77,7 @@ def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
     assert diagnosis.reason(KNOWN, None) == "it acts with probability more than 0.999"
     refused = replace(KNOWN, verdict=Verdict.CONFOUNDED)
     assert diagnosis.reason(refused, Refusal.ONE_POSE).endswith(
-        "not corrected, because what was found hangs on a single pose"
+        "not corrected, because a single pose decides the result"
     )
     assert "or else bias_drift (0.28): one of them with 0.995" in diagnosis.reason(GROUP, None)
 
