@@ -156,6 +156,15 @@ class Calibration:
         return tuple(map(text.caution, self._fitted.cautions))
 
     @property
+    def expanded_uncertainty(self) -> dict[str, float]:
+        """Of |a|, 95 %, in the unit of the reference vector: `this_fit` of the
+        calibration by itself, `this_sessions_poses` of one more pose of its
+        recording, with its noise, `another_day` of the next recording, with how
+        the unit starts. Empty where there is no budget."""
+        known = calibration_part(self.to_dict(), where="document").get("expanded_uncertainty_g")
+        return {k: float(v) for k, v in known.items() if v is not None} if isinstance(known, Mapping) else {}
+
+    @property
     def holds_at(self) -> HoldsAt | None:
         """The moment of its recording for which effects of time hold elsewhere."""
         return self._fitted.holds_at

@@ -341,6 +341,18 @@ def test_a_diagnosis_has_what_acts_with_its_probability(diagnosed: tc.Diagnosis)
     assert diagnosed.next_recording.expanded_uncertainty > diagnosed.next_recording.start_to_start
 
 
+def test_a_calibration_has_three_uncertainties_of_the_magnitude(diagnosed: tc.Diagnosis) -> None:
+    calibration = diagnosed.calibration
+    expanded = calibration.expanded_uncertainty
+    assert list(expanded) == ["this_fit", "this_sessions_poses", "another_day"]
+    assert 0 < expanded["this_fit"] < expanded["another_day"]
+    assert expanded["another_day"] == pytest.approx(diagnosed.next_recording.expanded_uncertainty, rel=1e-3)
+    document = calibration.to_dict()
+    assert expanded == document["expanded_uncertainty_g"]
+    del document["expanded_uncertainty_g"]
+    assert tc.Calibration.from_dict(document).expanded_uncertainty == {}
+
+
 @pytest.mark.parametrize("reference", ["1", None, 0.0, -1.0, float("nan"), [1.0]])
 def test_a_reference_that_is_no_positive_number_is_said(poses: tc.Poses, reference: Any) -> None:
     with pytest.raises(tc.InvalidData, match="reference: expected a positive number"):

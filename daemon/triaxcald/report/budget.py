@@ -41,6 +41,15 @@ class Uncertainty:
     halved_by: str
     if_halved_g: float | None
     not_evaluated: tuple[str, ...]
+    scopes: tuple[tuple[str, str, float | None], ...] = ()
+    """Name, meaning, and expanded uncertainty of |a| in g."""
+
+
+SCOPES = {
+    "this_fit": ("This fit", "the calibration by itself, at the reference conditions"),
+    "this_sessions_poses": ("This session’s poses", "one more pose of this recording, with its noise"),
+    "another_day": ("Another day", "the next recording, with how the unit starts"),
+}
 
 
 def read_uncertainty(calibration: Mapping[str, object]) -> Uncertainty | None:
@@ -61,7 +70,14 @@ def read_uncertainty(calibration: Mapping[str, object]) -> Uncertainty | None:
         halved_by=str(known.get("halved_by") or ""),
         if_halved_g=number(known.get("magnitude_if_halved_g")),
         not_evaluated=texts(known.get("not_evaluated")),
+        scopes=tuple(_scopes(mapping(calibration.get("expanded_uncertainty_g")))),
     )
+
+
+def _scopes(known: Mapping[str, object]) -> Iterator[tuple[str, str, float | None]]:
+    for key, (name, meaning) in SCOPES.items():
+        if key in known:
+            yield name, meaning, number(known[key])
 
 
 def _line(entry: Mapping[str, object]) -> BudgetLine:

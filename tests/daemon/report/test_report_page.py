@@ -394,6 +394,16 @@ def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) 
     assert "× 10⁻⁶ <uT> rms" in page.text
 
 
+def test_three_uncertainties_stand_by_what_they_are_of(budgeted: dict[str, Any]) -> None:
+    budgeted["calibration"]["expanded_uncertainty_g"] = {
+        "this_fit": 8.6e-5, "this_sessions_poses": 9.71e-5, "another_day": None,
+    }  # fmt: skip
+    text = " ".join(render(budgeted).text.split())
+    assert "This fit: the calibration by itself, at the reference conditions86.0 µg" in text
+    assert "This session’s poses: one more pose of this recording, with its noise97.1 µg" in text
+    assert "Another day: the next recording, with how the unit starts—" in text
+
+
 @pytest.mark.slow
 def test_a_limit_below_the_expanded_uncertainty_is_reserved_against(budgeted: dict[str, Any]) -> None:
     said = "The expanded uncertainty of the magnitude, 86.0 µg, is above the limit of 50.0 µg"
