@@ -28,7 +28,7 @@ GOES_WITH = {
     UnmodelledKind.TIME: "the time",
     UnmodelledKind.LOCAL: "one direction, or one end of an axis, which a few poses share",
 }
-BY_DIRECTION = " by its name, but the mean over all that may act, as a smooth function of the direction"
+BY_DIRECTION = "; the mean over all that may act is corrected, as a smooth function of the direction"
 REFUSED = {
     Refusal.UNMODELLED: "something that no known effect describes acts",
     Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
@@ -79,7 +79,7 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
 def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     """What else to know, a line each: nothing that anybody has to do."""
     if loop.refusal is not None:
-        yield f"no effect is corrected{BY_DIRECTION if loop.smooth else ''}, because {REFUSED[loop.refusal]}"
+        yield f"no effect is adopted, because {REFUSED[loop.refusal]}{BY_DIRECTION if loop.smooth else ''}"
     for name, expected in loop.advice.expected.items():
         if loop.stated[name] is None:  # not calibrated, so what it may become is not either
             continue

@@ -155,7 +155,7 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
         together = chance(finding.together)
         said += f", or else {others}: one of them with {together}"
     if finding.verdict is Verdict.CONFOUNDED and refusal is not None:
-        said += f"; not corrected, because {REFUSED[refusal]}"
+        said += f"; not adopted, because {REFUSED[refusal]}"
     return said
 
 

@@ -321,13 +321,13 @@ def test_an_outlier_beside_what_no_effect_describes_is_to_be_taken_again(bare: d
 def test_an_effect_that_is_known_and_not_corrected_is_in_question_no_more_than_its_name(bare: dict[str, Any]) -> None:
     bare["findings"] = [
         {"effect": "bias_drift", "verdict": "confounded", "probability": 0.997, "coefficients": {}, "alternatives": [],
-         "reason": "it acts with probability 0.997; not corrected, because a single pose decides the result",
+         "reason": "it acts with probability 0.997; not adopted, because a single pose decides the result",
          "remedy": ""}
     ]  # fmt: skip
     html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert "Effect found, cause uncertain" in text
-    assert "not corrected, because a single pose decides the result." in text
+    assert "not adopted, because a single pose decides the result." in text
     assert "Probability 0.997 Or instead none" in text
     assert "it is not certain that this effect acts" not in text
     assert "Who corrects it Nobody: it is not in the model" in text

@@ -76,9 +76,7 @@ def test_outliers_are_told_each_with_its_moment() -> None:
 def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
     assert diagnosis.reason(KNOWN, None) == "it acts with probability more than 0.999"
     refused = replace(KNOWN, verdict=Verdict.CONFOUNDED)
-    assert diagnosis.reason(refused, Refusal.ONE_POSE).endswith(
-        "not corrected, because a single pose decides the result"
-    )
+    assert diagnosis.reason(refused, Refusal.ONE_POSE).endswith("not adopted, because a single pose decides the result")
     assert "or else bias_drift (0.28): one of them with 0.995" in diagnosis.reason(GROUP, None)
 
 
