@@ -65,13 +65,14 @@ def loop_document(
             calibration["effects"][finding.effect][WEIGHT] = 1.0
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
         pose["before_residual_g"] = error(before.residual_g, reference)
+    following = next_recording(loop.after, budget(loop.after, stated))
     return {
         "format": "triaxcal.loop/1",
         "call": loop.call.value,
-        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)), stated)),
+        "summary": list(diagnosis.lines(loop, small, following, stated)),
         "before": residual_document(loop.before.residual, reference),
         "after": residual_document(loop.after.residual, reference),
-        **({"held_out": _held_out(loop.held_out, reference)} if loop.held_out else {}),
+        **({"held_out": _held_out(loop.held_out, following.expanded_uncertainty, reference)} if loop.held_out else {}),
         "findings": [_finding(f, loop.refusal, reference_unit) for f in loop.findings],
         "candidates": [
             {
@@ -201,10 +202,11 @@ def _another(loop: Loop) -> Document | None:
     }
 
 
-def _held_out(held: HoldOut, reference: float) -> Document:
+def _held_out(held: HoldOut, another_day: float, reference: float) -> Document:
     return {
         "before_rms_g": error(held.before_rms_g, reference),
         "after_rms_g": error(held.after_rms_g, reference),
         "noise_floor_g": error(held.noise_floor_g, reference),
         "poses": held.poses,
+        "contradicts": held.contradicts(another_day),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -20,6 +21,13 @@ CLEARLY = 2.0
 chance in one recording of forty."""
 
 
+class Contradiction(StrEnum):
+    UNCERTAINTY = "uncertainty"
+    """The error is larger than the uncertainty that was stated."""
+    CORRECTION = "correction"
+    """The linear calibration is better than the one with effects."""
+
+
 @dataclass(frozen=True)
 class HoldOut:
     """In the unit of the reference."""
@@ -32,6 +40,14 @@ class HoldOut:
     poses: int
     worse: bool = False
     """Whether the linear calibration is clearly better in these poses."""
+
+    def contradicts(self, another_day: float) -> Contradiction | None:
+        """What these poses contradict, where the calibration promises so large
+        an expanded uncertainty on another day."""
+        # An rms is compared with an expanded uncertainty, which is two standard ones.
+        if np.sqrt(max(self.after_rms_g**2 - self.noise_floor_g**2, 0.0)) > another_day:
+            return Contradiction.UNCERTAINTY
+        return Contradiction.CORRECTION if self.worse else None
 
 
 def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HoldOut:

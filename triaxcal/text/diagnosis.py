@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Residual
-from triaxcal.estimate.hold_out import HoldOut
+from triaxcal.estimate.hold_out import Contradiction, HoldOut
 from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.number_format import number_of, plain
@@ -213,15 +213,12 @@ def excluded(loop: Loop, small: ErrorUnit) -> str:
 def contradiction(loop: Loop, scopes: Scopes, small: ErrorUnit) -> str:
     """What the check recording contradicts; empty where nothing."""
     held = loop.held_out
-    if held is None:
+    found = held and held.contradicts(scopes.another_day)
+    if not held or not found:
         return ""
-    error, floor = held.after_rms_g, held.noise_floor_g
-    # An rms is compared with an expanded uncertainty, which is two standard ones.
-    if np.sqrt(max(error**2 - floor**2, 0.0)) > scopes.another_day:
-        most = small.in_full(scopes.another_day)
-        said = f"{small.in_full(error)} rms there, expanded uncertainty on another day {most}"
-    elif held.worse:
-        said = f"{small.in_full(held.before_rms_g)} rms there with the linear model, {small.in_full(error)} after"
+    error = small.in_full(held.after_rms_g)
+    if found is Contradiction.UNCERTAINTY:
+        said = f"{error} rms there, expanded uncertainty on another day {small.in_full(scopes.another_day)}"
     else:
-        return ""
+        said = f"{small.in_full(held.before_rms_g)} rms there with the linear model, {error} after"
     return f"the check recording contradicts the calibration: {said}"

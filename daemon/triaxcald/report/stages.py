@@ -42,6 +42,8 @@ class HoldOut:
     after_rms_g: float | None
     noise_floor_g: float | None
     poses: int | None
+    contradicts: bool = False
+    """Whether these poses contradict the calibration."""
 
 
 def residual_of(value: object) -> Residual | None:
@@ -59,6 +61,7 @@ def held_out_of(document: Mapping[str, object]) -> HoldOut | None:
         number(known.get("after_rms_g")),
         number(known.get("noise_floor_g")),
         None if poses is None else int(poses),
+        known.get("contradicts") is not None,
     )
 
 

@@ -30,6 +30,7 @@ _MOST_NAMED = 3
 USABLE = "usable"
 _CALLS = {USABLE: "Usable", "record_more": "Record more", "investigate": "Investigate"}
 """What to do with the calibration, as documents have it."""
+_CONTRADICTED = "The check recording contradicts the calibration"
 _ANOTHER = "one calibration does not hold in all poses"
 
 
@@ -87,9 +88,12 @@ def judge(
     """
     failed = final is not None and final.verdict == "fail"
     found = _concluded(_judged(outcome, certificate_limits, expanded_g, failed), final)
+    if outcome.held_out is not None and outcome.held_out.contradicts and found.kind != "refused":
+        kind: Kind = "unexplained" if found.kind == "within" else found.kind
+        found = replace(found, kind=kind, headline=f"{_CONTRADICTED}; {found.headline[:1].lower()}{found.headline[1:]}")
     if not (doubts := doubts_of(outcome.doubts)):
         return found
-    kind: Kind = "unexplained" if found.kind == "within" else found.kind
+    kind = "unexplained" if found.kind == "within" else found.kind
     return replace(found, kind=kind, headline="; ".join([found.headline, *doubts]))
 
 

@@ -194,7 +194,8 @@ def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
     assert document["format"] == "triaxcal.loop/1"
     assert set(document) == LOOP | {"held_out", "unit"}
     assert set(document["before"]) == set(document["after"]) == RESIDUAL
-    assert set(document["held_out"]) == {"before_rms_g", "after_rms_g", "noise_floor_g", "poses"}
+    assert set(document["held_out"]) == {"before_rms_g", "after_rms_g", "noise_floor_g", "poses", "contradicts"}
+    assert document["held_out"]["contradicts"] is None
     assert document["held_out"]["poses"] >= 26
     assert document["held_out"]["after_rms_g"] < 0.5 * document["held_out"]["before_rms_g"]
     found = _likeliest(document)["coefficients"]

@@ -394,6 +394,14 @@ def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) 
     assert "× 10⁻⁶ <uT> rms" in page.text
 
 
+@pytest.mark.parametrize("contradicts", ["uncertainty", "correction", None])
+def test_what_the_check_recording_contradicts_comes_first(bare: dict[str, Any], contradicts: str | None) -> None:
+    bare["held_out"]["contradicts"] = contradicts
+    page = render(bare)
+    headline = "The check recording contradicts the calibration; "
+    assert (headline in page.verdict_text) is (contradicts is not None)
+
+
 def test_three_uncertainties_stand_by_what_they_are_of(budgeted: dict[str, Any]) -> None:
     budgeted["calibration"]["expanded_uncertainty_g"] = {
         "this_fit": 8.6e-5, "this_sessions_poses": 9.71e-5, "another_day": None,

@@ -12,7 +12,7 @@ from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.hold_out import held_out, magnitude_errors
+from triaxcal.estimate.hold_out import Contradiction, HoldOut, held_out, magnitude_errors
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -79,3 +79,16 @@ def test_poses_without_a_channel_that_is_needed_are_refused_by_its_name(
         held_out(c, c, [replace(p, channels={}) for p in poses])
     with pytest.raises(InvalidData, match="no still pose"):
         held_out(c, c, [])
+
+
+@pytest.mark.parametrize(
+    ("held", "expected"),
+    [
+        (HoldOut(1e-4, 3e-4, 1e-4, 9), Contradiction.UNCERTAINTY),
+        (HoldOut(1e-4, 3e-4, 2.9e-4, 9), None),  # noise explains it
+        (HoldOut(1e-4, 1.5e-4, 1e-5, 9, worse=True), Contradiction.CORRECTION),
+        (HoldOut(2e-4, 1.5e-4, 1e-5, 9), None),
+    ],
+)
+def test_what_poses_of_another_recording_contradict(held: HoldOut, expected: Contradiction | None) -> None:
+    assert held.contradicts(2e-4) == expected
