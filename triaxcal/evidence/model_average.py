@@ -34,8 +34,9 @@ NOTICEABLE = 0.1
 """Of the standard error of a pose: a name that is unlikely and corrects less is
 not listed."""
 SELECTED_LEAST = 0.03
-"""Of the mean square of what an unlikely name may do: a name that corrects less
-only adds coefficients that nobody knows."""
+"""An unlikely name is dropped if its mean correction holds less than this share
+of its expected square: its coefficients would add uncertainty and hardly any
+correction."""
 STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where
 they go."""

@@ -30,8 +30,8 @@ degree that is corrected (`effects.empirical.DEGREES`)."""
 OF_DIRECTION = (UnmodelledKind.DIRECTION, UnmodelledKind.ODD, UnmodelledKind.EVEN, UnmodelledKind.LOCAL)
 DRAWN_ANEW = (UnmodelledKind.EACH_POSE, UnmodelledKind.POSE_BEFORE)
 ROUGHER = 4.0
-"""Times the variance that a covariance leaves of a function of direction: steps
-and bends are rougher between poses than any smooth function."""
+"""Factor on the variance between poses. Steps and bends vary more there than the
+assumed smooth covariance allows."""
 NOWHERE = 1e3
 """References: so far from every pose that none is near, though it is a number."""
 ACROSS = 4.0
@@ -42,11 +42,12 @@ degree in the force, drawn at random, it is 3.0, 7.4, 2.5 and 4.6."""
 
 @dataclass(frozen=True, eq=False)
 class _OfPart:
-    """What a part of the evidence adds to |a| over M readings: the best linear
-    prediction ``to`` (M,N) by the rows, the variance of its ``error`` (M,), and
-    the covariance (h,h) that this gives the coefficients of a smooth term, with
-    their variances ``prior`` (h,) to the poses; all but for the noise.
-    ``smooth`` is whether it is a function of direction."""
+    """One unmodelled part, seen from M readings over the sphere: ``to`` (M,N)
+    predicts it linearly from the rows, and ``error`` (M,) is the variance of
+    that prediction. ``of_smooth`` (h,h) is the covariance that remains in the
+    smooth coefficients, ``prior`` (h,) their variance before the poses were
+    seen. All are in units of the noise variance. ``smooth`` is true for a
+    function of direction."""
 
     to: Floats
     error: Floats

@@ -203,10 +203,10 @@ class _Driver:
     """Coefficients that act on |a| by ``loading`` (n,) times functions of one
     variable ``x`` (n,). ``functions`` gives k values of them (k,p), and
     ``absorbed`` those of the functions (k,h) of the same variable that the nine
-    parameters can take away from them. ``whole``: these alone are taken away;
-    else the function itself may also come out smaller, as it does where the
-    variable went along with the directions. ``rows`` (n,) are the poses in
-    which it acts."""
+    parameters can take away from them. ``whole`` is true where the nine
+    parameters remove exactly the functions in ``absorbed``. Otherwise they may
+    also reduce the effect's own function, because the variable was correlated
+    with the directions. ``rows`` (n,) are the poses in which it acts."""
 
     variable: str
     quantity: Quantity
