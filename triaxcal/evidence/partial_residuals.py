@@ -428,16 +428,22 @@ class _Data:
         problem = self.rows.problem
         runs = runs_named(effect.coefficients[i].name for i in index) if name != RUN else ()
         rows = np.isin(self.rows.run, runs) if runs else np.ones(self.rows.n, dtype=bool)
-        held = {n: float(np.median(self.covariates[n][rows])) for n in effect.needs}
+        median = {n: float(np.median(self.covariates[n][rows])) for n in effect.needs}
+
+        def at(x: Floats, covariates: Mapping[str, Floats]) -> Floats:
+            full = np.tile(problem.reference * np.eye(AXES)[axis], (len(x), 1))
+            moved = {**covariates, name: x - problem.channel_reference[name]}
+            return effect.basis(full, moved)[:, axis, index]
 
         def functions(x: Floats) -> Floats:
-            full = np.tile(problem.reference * np.eye(AXES)[axis], (len(x), 1))
-            covariates = {n: np.full(len(x), v) for n, v in held.items()}
-            return effect.basis(full, covariates | {name: x - problem.channel_reference[name]})[:, axis, index]
+            return at(x, {n: np.full(len(x), v) for n, v in median.items()})
 
         on_axis = replace(self.on_axis(name, axis, problem.channels[name], functions), rows=rows)
+        # A step inside a pose goes by that pose's own duration.
+        durations = {n: self.covariates[n] for n in effect.needs if n == DURATION}
+        in_poses = at(on_axis.x, {n: np.full(self.rows.n, v) for n, v in median.items()} | durations)
         for gain in (np.ones(self.rows.n), self.s[:, axis] / problem.reference):
-            if _same((gain[:, None] * functions(on_axis.x))[rows], basis[rows]):
+            if _same((gain[:, None] * in_poses)[rows], basis[rows]):
                 yield replace(on_axis, loading=on_axis.loading * gain)
 
     def of_reading(self, axis: int, functions: Callable[[Floats], Floats]) -> _Driver:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
-from triaxcal.effects.contract import Coefficient, Effect, no_slope
+from triaxcal.effects.contract import SINCE_START, TIME, Coefficient, Effect, no_slope
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.recordings import together
@@ -122,6 +122,21 @@ def test_along_a_covariate_the_curve_goes_as_the_bias_does(poses_with: Poses, na
         for trace, true in zip(of_effect(rows, c, name), ALL[name], strict=True):
             rise = (trace.curve[-1] - trace.curve[0]) / (trace.grid[-1] - trace.grid[0])
             assert 0.4 < rise / true < 1.15
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 4.0])
+def test_a_step_is_drawn_over_time_however_long_each_pose_was_held(poses_with: Poses, jitter_s: float) -> None:
+    """The pose in which it falls goes by its own duration, and stays on the picture with its residual."""
+    rng, poses = np.random.default_rng(3), poses_with(1)
+    poses = [
+        replace(p, start_s=p.start_s + jitter_s * a, end_s=p.end_s - jitter_s * b)
+        for p, (a, b) in zip(poses, rng.uniform(0, 1, (len(poses), 2)), strict=True)
+    ]
+    middle = poses[13]
+    effect = effect_named("bias_step").shaped({"at": (middle.start_s + middle.end_s) / 2 + 0.1})
+    for trace in of_effect(*traced(poses, effect), "bias_step"):
+        assert trace.variable in (TIME, SINCE_START)
+        assert len(trace.x) > 1
 
 
 def test_an_effect_on_several_axes_at_once_is_drawn_against_its_own_prediction(poses_with: Poses) -> None:
