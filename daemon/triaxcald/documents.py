@@ -20,7 +20,7 @@ from triaxcal.interchange.calibration_document import (
     coefficients_document,
     residual_document,
 )
-from triaxcal.rounding import chance, error, in_standard_errors, known_to, number, numbers, uncertainty
+from triaxcal.rounding import chance, error, in_standard_errors, known_to, number, numbers, probability, uncertainty
 from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import next_recording
@@ -120,6 +120,7 @@ def _trace(trace: Trace, reference: float, reference_unit: str) -> Document:
         "variable_unit": in_units_of(unit_of(trace.variable), reference_unit),
         "quantity": trace.quantity.value,
         "share": uncertainty(trace.share),
+        "p_value": probability(trace.p_value),
         "pose": trace.pose.tolist(),
         "x": numbers(trace.x),
         "y": [value(float(y), float(known)) for y, known in zip(trace.y, trace.error, strict=True)],

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.distributions import t_ppf
+from triaxcal.distributions import f_sf, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import (
     BEFORE,
@@ -94,8 +94,9 @@ class Trace:
     ``excluded`` (k,) the poses that the fit does not use. ``curve`` (m,) is the
     contribution at the values ``grid`` (m,) of the variable, and
     ``half_width`` (m,) that of its 95 % band; none where there is no curve.
-    ``share`` is how telling the variable of an unexplained residual is
-    (`telling_variables`), else None.
+    ``share`` is how telling the variable of an unexplained residual is, and
+    ``p_value`` how often chance makes any variable as telling
+    (`telling_variables`); else None.
     """
 
     effect: str
@@ -112,6 +113,7 @@ class Trace:
     curve: Floats
     half_width: Floats
     share: float | None = None
+    p_value: float | None = None
 
 
 def of_effect(rows: LinearisedData, c: Calibration, name: str) -> tuple[Trace, ...]:
@@ -136,12 +138,13 @@ def telling_variables(rows: LinearisedData, c: Calibration) -> tuple[Trace, ...]
     smooth curve in the variable takes away beside the nine parameters: 1 less
     the ratio of the mean squares with and without it. The curve is a polynomial
     of degree 5 in the reading of an axis, whose first three terms the nine
-    absorb, and of degree 2 on each axis in any other variable.
+    absorb, and of degree 2 on each axis in any other variable. The probability
+    is that of the F test, times the number of variables (Bonferroni).
     """
     data = _Data.of(rows, c).of_means()
     found = [fit for drivers in data.candidates() if drivers and (fit := data.fitted(drivers)) is not None]
     best = sorted(found, key=lambda fit: -fit.share)[:PANELS]
-    return tuple(data.trace_of_curve(fit) for fit in best)
+    return tuple(data.trace_of_curve(fit, min(1.0, fit.p_value * len(found))) for fit in best)
 
 
 def residuals(c: Calibration) -> Trace:
@@ -222,11 +225,12 @@ class _Driver:
 @dataclass(frozen=True, eq=False)
 class _Curve:
     """A smooth curve in one variable: the ``coefficients`` of all ``drivers``,
-    as many of each."""
+    as many of each. ``p_value`` is that of its F test."""
 
     drivers: Sequence[_Driver]
     coefficients: _Coefficients
     share: float
+    p_value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,7 +507,9 @@ class _Data:
         inverse = np.linalg.pinv((columns / size).T @ (columns / size), rcond=SAME, hermitian=True)
         covariance = max(1.0, after) * inverse / np.outer(size, size)
         coverage = float(t_ppf((1 + LEVEL) / 2, free - rank))
-        return _Curve(drivers, _Coefficients(q, covariance, coverage), 1 - after / (before / free))
+        explained = max(before - after * (free - rank), 0.0) / rank
+        p_value = float(f_sf(explained / after, rank, free - rank)) if after > 0 else 0.0
+        return _Curve(drivers, _Coefficients(q, covariance, coverage), 1 - after / (before / free), p_value)
 
     def columns(self, drivers: Sequence[_Driver]) -> Floats:
         """(N,p) as `LinearisedData.by_coefficients` has them, in the means
@@ -512,7 +518,7 @@ class _Data:
         means = -np.concatenate(each, axis=1)
         return np.concatenate([means, np.zeros((len(self.rows.y) - self.rows.n, means.shape[1]))])
 
-    def trace_of_curve(self, fit: _Curve) -> Trace:
+    def trace_of_curve(self, fit: _Curve, p_value: float) -> Trace:
         """On the axis on which it does most."""
         contribution, of = self.contribution(self.columns(fit.drivers)), fit.coefficients
         parts = np.array_split(np.arange(len(of.values)), len(fit.drivers))
@@ -520,7 +526,7 @@ class _Data:
         residual = self.residual - contribution @ of.values
         own = parts[best]
         made = self.trace(fit.drivers[best], contribution[:, own], of.only(own), residual)
-        return replace(made, share=fit.share)
+        return replace(made, share=fit.share, p_value=p_value)
 
 
 def unit_of(variable: str) -> str:

@@ -76,7 +76,7 @@ def y_label(trace: Trace, small: ErrorUnit) -> str:
 
 
 def description(trace: Trace, small: ErrorUnit) -> str:
-    """The panel in a sentence, for who does not see it."""
+    """The panel in a sentence, for readers who cannot see the picture."""
     poses = f"{len(trace.x)} poses" + (f", {int(trace.excluded.sum())} excluded" if trace.excluded.any() else "")
     told = "" if trace.share is None else f"; a smooth curve takes {100 * max(trace.share, 0.0):.0f} % of it away"
     return f"{title(trace)}: {y_label(trace, small)} against {x_label(trace, small)}, {poses}{told}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from triaxcal.effects.contract import SINCE_START
 from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace
 from triaxcal.pictures import Inks, paint_trace
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
 from triaxcal.text import traces as words
 from triaxcal.units import ErrorUnit
 from triaxcald.report.document import CANDIDATE, Finding, Outcome, Pose
@@ -76,6 +77,7 @@ def read_traces(value: object) -> Iterator[Trace]:
                 curve=fitted if whole else nothing,
                 half_width=half if whole else nothing,
                 share=number(known.get("share")),
+                p_value=number(known.get("p_value")),
             )
 
 
@@ -123,13 +125,22 @@ def _caption(trace: Trace, outcome: Outcome) -> str:
     if trace.quantity is Quantity.STANDARD_ERRORS:
         return _of_residuals(outcome)
     if trace.share is not None:
-        return f"Smooth curves on three axes take away {100 * max(trace.share, 0.0):.0f} % (adjusted)"
+        return _of_curve(trace.share, trace.p_value)
     if trace.effect == words.SMOOTH:
         return "The mean over all that may act, as a function of the direction"
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
     if finding is None:
         return f"Probability {chance(outcome.averaged.get(trace.effect))}, and corrected by as much"
     return _of_finding(finding)
+
+
+def _of_curve(share: float, p_value: float | None) -> str:
+    said = f"Smooth curves on three axes take away {100 * max(share, 0.0):.0f} % (adjusted)"
+    if p_value is None:
+        return said
+    if p_value > SIGNIFICANT:
+        return f"{said}, no more than chance does for one of these variables (p {p_value:.2g})"
+    return f"{said}; chance does as much with p {p_value:.1g}"
 
 
 def _of_finding(finding: Finding) -> str:
