@@ -92,6 +92,8 @@ def in_units_of(unit: str, reference_unit: str) -> str:
     the reference vector, and with the names of channels in brackets."""
     if reference_unit == "g":
         return unit
+    if unit == "g":
+        return reference_unit
     parts = _CHANNEL.split(unit)
     return "".join(p if p.startswith("[") else _G.sub(lambda _: grouped(reference_unit), p) for p in parts)
 

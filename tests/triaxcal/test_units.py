@@ -27,6 +27,8 @@ def test_g_is_replaced_as_a_unit_and_in_no_name(unit: str, of_tesla: str) -> Non
 
 
 def test_a_unit_with_a_fraction_stands_in_brackets() -> None:
+    assert in_units_of("g", "m/s²") == "m/s²"
+    assert in_units_of("g/K", "m/s²") == "(m/s²)/K"
     assert in_units_of("g/g", r"\1/s") == r"(\1/s)/(\1/s)"
 
 
