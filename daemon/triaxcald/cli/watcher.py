@@ -18,7 +18,7 @@ import signal
 import time
 from contextlib import suppress
 
-from triaxcald.abort import CLOSING_S, STOP_SIGNALS
+from triaxcald.abort import CLOSING_S, STOP_SIGNALS, ignore_stop_signals
 
 LAST = 3  # the signal that ends the process at once
 UNHEARD_S = 1.5
@@ -86,8 +86,7 @@ class Watcher:
 def _watch(heard: int, echo: int, parent: int) -> None:
     """The life of the watcher. Never returns, whatever happens."""
     try:
-        for number in STOP_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+        ignore_stop_signals()
         os.setsid()  # no terminal of its own, which could hang up
         # Who waits for the end of an output must not wait for the watcher's,
         # nor the watcher for its own.
