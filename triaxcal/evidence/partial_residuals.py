@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.optimize import nnls
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import f_sf, t_ppf
@@ -186,12 +188,6 @@ class _Coefficients:
         """(m,) of sums of them, by so much (m,p) of each."""
         return np.asarray(np.sqrt(np.maximum(np.einsum("mp,pq,mq->m", by_one, self.covariance, by_one), 0.0)))
 
-    @property
-    def relative_error(self) -> float:
-        """Of all of them by one factor."""
-        squared = float(self.values @ np.linalg.pinv(self.covariance, hermitian=True) @ self.values)
-        return float(1 / np.sqrt(max(squared, 1e-300)))
-
     def only(self, index: Ints, given: Ints | None = None) -> _Coefficients:
         """Some of them, as they are known if those ``given`` are as estimated."""
         covariance = self.covariance[np.ix_(index, index)]
@@ -318,7 +314,7 @@ class _Data:
         """``contribution`` (n,p) as above, ``residual`` (n,) that of the full
         model."""
         if driver is None:
-            return self._against_predicted(residual, contribution @ of.values, of)
+            return self._against_predicted(residual, contribution, of)
         shown = driver.rows & (np.abs(driver.loading) >= VISIBLE)
         grid = _grid(driver, driver.x[shown])
         curves = self._curves(driver, contribution)
@@ -360,11 +356,16 @@ class _Data:
         found = _least_squares(np.concatenate([own, taken], axis=1), target)
         return lambda x: np.asarray(np.concatenate([driver.functions(x), driver.absorbed(x)], axis=1) @ found)
 
-    def _against_predicted(self, residual: Floats, predicted: Floats, of: _Coefficients) -> Trace:
+    def _against_predicted(self, residual: Floats, contribution: Floats, of: _Coefficients) -> Trace:
         """Of an effect that no single variable drives: the curve is the straight
-        line on which both are equal, and the band that of the whole effect's
-        size."""
+        line on which both are equal. The variance of the contribution to the
+        poses, which makes the band, is fitted by a constant and a multiple of
+        its square."""
+        predicted = contribution @ of.values
         grid = np.linspace(predicted.min(), predicted.max(), POINTS)
+        size = max(float(np.abs(predicted).max()), 1e-300)
+        variance = of.standard_error(contribution) ** 2
+        constant, by_square = nnls(np.stack([np.ones(len(predicted)), (predicted / size) ** 2], axis=1), variance)[0]
         return Trace(
             effect="",
             axis="",
@@ -378,7 +379,7 @@ class _Data:
             excluded=~self.in_fit,
             grid=grid,
             curve=grid,
-            half_width=of.coverage * of.relative_error * np.abs(grid),
+            half_width=of.coverage * np.sqrt(constant + by_square * (grid / size) ** 2),
         )
 
     # What drives an effect.
@@ -388,9 +389,7 @@ class _Data:
         poses show it."""
         try:
             basis = effect.basis(self.s, self.covariates)[:, :, index]
-            axes = [i for i in range(AXES) if basis[:, i].any()]
-            tried = self._drivers(effect, index, axes[0], basis[:, axes[0]]) if len(axes) == 1 else iter(())
-            return next((driver for driver in tried if self._shows(driver)), None)
+            return next((driver for driver in self._drivers(effect, index, basis) if self._shows(driver)), None)
         except (EffectFault, Refused):  # of another package, which does not say what it adds elsewhere
             return None
 
@@ -398,17 +397,18 @@ class _Data:
         x = driver.x[driver.rows & self.in_fit & (np.abs(driver.loading) >= VISIBLE)]
         return len(x) > 1 and bool(np.ptp(x) > 0)
 
-    def _drivers(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
-        """Those by which the ``basis`` (n,p) on the axis follows from one
-        variable."""
-        if effect.needs:
-            yield from self._by_covariate(effect, index, axis, basis)
-        else:
-            yield from self._by_reading(effect, index, axis, basis)
+    def _drivers(self, effect: Effect, index: Ints, basis: Floats) -> Iterator[_Driver]:
+        """Those by which the ``basis`` (n,3,p) follows from one variable."""
+        axes = [i for i in range(AXES) if basis[:, i].any()]
+        if not effect.needs:
+            if len(axes) == 1:
+                yield from self._by_own_reading(effect, index, axes[0], basis[:, axes[0]])
+            yield from self._by_two_readings(effect, index, basis)
+        elif len(axes) == 1:
+            yield from self._by_covariate(effect, index, axes[0], basis[:, axes[0]])
 
-    def _by_reading(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
-        """By that of the axis itself, or by that of another, with which its
-        scale factor changes."""
+    def _by_own_reading(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
+        """By that of the axis on which alone it acts."""
         reference = self.rows.problem.reference
 
         def own(x: Floats) -> Floats:
@@ -416,13 +416,24 @@ class _Data:
 
         if _same(own(self.s[:, axis]), basis):
             yield self.of_reading(axis, lambda x: own(x) * x[:, None] / reference)
-        for other in range(AXES):
-            if other != axis:
-                functions = _Beside(effect, index, axis, other, reference)
-                gain = self.s[:, axis] / reference
-                if _same(gain[:, None] * functions(self.s[:, other]), basis):
-                    on_axis = self.on_axis(READINGS[other], axis, self.s[:, other], functions)
-                    yield replace(on_axis, loading=on_axis.loading * gain)
+
+    def _by_two_readings(self, effect: Effect, index: Ints, basis: Floats) -> Iterator[_Driver]:
+        """By the reading of one axis, times the square of that of another:
+        what changes the scale factor of the one by the reading of the other, on
+        whichever of the two it acts."""
+        reference = self.rows.problem.reference
+        along = np.einsum("ni,nip->np", self.s, basis)
+        for axis, other in permutations(range(AXES), 2):
+
+            def functions(x: Floats, axis: int = axis, other: int = other) -> Floats:
+                s = np.zeros((len(x), AXES))
+                s[:, axis], s[:, other] = reference, x
+                return np.asarray(np.einsum("ni,nip->np", s, effect.basis(s, {})[:, :, index]) / reference)
+
+            gain = self.s[:, axis] / reference
+            if _same(gain[:, None] ** 2 * reference * functions(self.s[:, other]), along):
+                on_axis = self.on_axis(READINGS[other], axis, self.s[:, other], functions)
+                yield replace(on_axis, loading=on_axis.loading * gain)
 
     def _by_covariate(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
         """On the bias of the axis, or on its scale factor."""
@@ -588,23 +599,6 @@ def _on_sphere(x: Floats, axis: int, reference: float) -> Floats:
     rest in equal parts along the others."""
     rest = np.sqrt(np.maximum(reference**2 - x**2, 0.0) / 2)
     return np.stack([x if i == axis else rest for i in range(AXES)], axis=1)
-
-
-@dataclass(frozen=True)
-class _Beside:
-    """What an effect adds to an axis at the reference, where another axis reads
-    x: (k,p)."""
-
-    effect: Effect
-    index: Ints
-    axis: int
-    other: int
-    reference: float
-
-    def __call__(self, x: Floats) -> Floats:
-        s = np.zeros((len(x), AXES))
-        s[:, self.axis], s[:, self.other] = self.reference, x
-        return np.asarray(self.effect.basis(s, {})[:, self.axis, self.index])
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ def title(trace: Trace) -> str:
     """What the panel is of."""
     every = trace.effect == SMOOTH  # dozens of coefficients, which mean nothing one by one
     listed = ", ".join(() if every else trace.coefficients)
-    on = f", axis {trace.axis}" if trace.axis else f", {listed}" if listed else ""
+    of_two = trace.quantity is Quantity.READING and trace.variable in READINGS  # it may act on either axis
+    on = f", axis {trace.axis}" if trace.axis and not of_two else f", {listed}" if listed else ""
     runs = runs_named(trace.coefficients) if trace.variable != RUN else ()
     on += "".join(f", recording {run + 1}" for run in runs)
     if trace.effect:

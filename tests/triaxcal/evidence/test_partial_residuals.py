@@ -11,6 +11,8 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import SINCE_START, TIME, Coefficient, Effect, no_slope
+from triaxcal.effects.cross_coupling import CrossCoupling
+from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.recordings import together
@@ -26,6 +28,7 @@ from triaxcal.evidence.partial_residuals import (
     telling_variables,
     unit_of,
 )
+from triaxcal.model.sensor import LINEAR
 from triaxcal.poses.pose import Pose
 
 Poses = Callable[..., list[Pose]]
@@ -157,6 +160,42 @@ def test_an_effect_on_several_axes_at_once_is_drawn_against_its_own_prediction(p
     assert (trace.variable, trace.axis, trace.coefficients) == (PREDICTED, "", ("all",))
     np.testing.assert_array_equal(trace.grid, trace.curve)
     np.testing.assert_allclose(trace.half_width / np.abs(trace.grid), trace.half_width[0] / abs(trace.grid[0]))
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_cross_coupling_is_drawn_against_the_reading_of_the_other_axis(poses_with: Poses, whole: bool) -> None:
+    """|a| shows the same of a product on one axis and of the square of that axis on the other: so does the picture."""
+    q = {"x_xy": 2e-3}
+    true = [q.get(o.name, 0.0) for o in CrossCoupling().coefficients]
+    rows, c = traced(poses_with(1, cross_coupling=true), CrossCoupling())
+    if whole:  # half of it on the other axis
+        effect, ((_, found),) = CrossCoupling(whole=True), c.sensor.effects
+        known = dict(zip([o.name for o in CrossCoupling().coefficients], found, strict=True))
+        values = np.array([known["x_xy"] / 2 if o.name in ("x_xy", "y_xx") else 0.0 for o in effect.coefficients])
+        n = LINEAR + len(values)
+        covariance = np.zeros((n, n))
+        covariance[:LINEAR, :LINEAR] = c.covariance[:LINEAR, :LINEAR]
+        c = replace(c, sensor=replace(c.sensor, effects=((effect, values),)), covariance=covariance)
+    trace = next(t for t in of_effect(rows, c, "cross_coupling") if "x_xy" in t.coefficients)
+    assert (trace.variable, trace.axis, trace.quantity) == ("reading_y", "x", Quantity.READING)
+    rise = np.polyfit(trace.grid, trace.curve, 1)[0]
+    assert 0.4 < rise / q["x_xy"] < 1.15
+    np.testing.assert_allclose(trace.curve, np.polyval(np.polyfit(trace.grid, trace.curve, 1), trace.grid), atol=1e-9)
+
+
+def test_the_band_against_the_prediction_is_that_of_the_contribution_to_the_poses(poses_with: Poses) -> None:
+    """Many coefficients of opposite signs are each uncertain where their sum is small."""
+    rows, c = traced(poses_with(1), Empirical("odd"))
+    (trace,) = of_effect(rows, c, Empirical().name)
+    X = -rows.by_coefficients(Empirical("odd"))[: rows.n] * rows.error[: rows.n, None]
+    nine = rows.linear[: rows.n] * rows.error[: rows.n, None]
+    weight = 1 / rows.error[: rows.n, None]
+    X = X - nine @ np.linalg.lstsq(nine * weight, X * weight, rcond=None)[0]
+    own = c.covariance[LINEAR:, LINEAR:]
+    deviation = np.sqrt(np.einsum("np,pq,nq->n", X, own, X))
+    half = np.interp(trace.x, trace.grid, trace.half_width) / c.coverage_factor(0.95)
+    assert trace.variable == PREDICTED
+    assert np.mean(half**2) == pytest.approx(np.mean(deviation**2), rel=0.1)
 
 
 def test_a_model_without_the_effect_has_no_trace_of_it(poses_with: Poses) -> None:
