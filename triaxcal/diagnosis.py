@@ -23,6 +23,7 @@ from triaxcal.evidence.findings import Findings, Named, findings, stated
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.information_gain import Advice, advice, decided
 from triaxcal.evidence.model_average import Refusal, average
+from triaxcal.evidence.over_sphere import OF_DIRECTION
 from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
@@ -121,7 +122,8 @@ class Loop:
         """What the poses show of each finding and each candidate, against what
         drives it; where there are none, of the likeliest effects that are
         corrected all the same. Of what has no name, against the variables that
-        tell most of it, with the first finding in the model. Where the unit or
+        tell most of it, with the first finding in the model; the readings first
+        where it goes with the direction. Where the unit or
         its mounting changed, or no effect probably acts, the residuals."""
         rows = self.posterior.evidence.rows
         names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
@@ -130,7 +132,9 @@ class Loop:
         something = self.found.nothing < self.posterior.evidence.odds.reported
         unnamed = self.found.unexplained.significant or (something and not names and not self.found.outliers)
         with_finding = self.conditional_on.get(self.findings[0].effect, self.after) if self.findings else self.after
-        of_rest = telling_variables(rows, with_finding) if unnamed and self.found.change_point is None else ()
+        by_direction = unnamed and self.found.unexplained.kind in OF_DIRECTION
+        shown = unnamed and self.found.change_point is None
+        of_rest = telling_variables(rows, with_finding, by_direction) if shown else ()
         found = (*(trace for each in of_names for trace in each), *of_rest)
         return (*found, residuals(self.after)) if self.found.change_point or not found else found
 

@@ -182,5 +182,11 @@ def _cautions(c: Calibration) -> Iterator[Caution]:
     p = probability(c.residual.lack_of_fit_p)
     if p is not None and p < SIGNIFICANT:
         yield ExcessVariance(c.excess_g / c.reference) if c.excess_g else BirgeRatio(c.birge_ratio)
+    yield from too_small(c.residual)
+
+
+def too_small(residual: Residual) -> Iterator[ResidualsTooSmall]:
+    """Of residuals that noise and creep hardly ever leave so small."""
+    p = probability(residual.lack_of_fit_p)
     if p is not None and p > 1 - SIGNIFICANT / 5:
         yield ResidualsTooSmall()

@@ -10,7 +10,8 @@ import numpy as np
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
-from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
+from triaxcal.estimate.caution import BirgeRatio, ExcessVariance, ResidualsTooSmall
+from triaxcal.estimate.fit_assessment import too_small
 from triaxcal.estimate.likelihood import State, linearise
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.mixture_components import components
@@ -54,7 +55,9 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> tuple[C
         return after, refused
     beyond = extrapolated(after)
     after = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
-    return _with_residuals(after, rows, model_average), refused
+    after = _with_residuals(after, rows, model_average)
+    others = (c for c in after.cautions if not isinstance(c, ResidualsTooSmall))
+    return replace(after, cautions=(*others, *too_small(after.residual))), refused
 
 
 def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, float]:

@@ -132,9 +132,9 @@ def of_effect(rows: LinearisedData, c: Calibration, name: str) -> tuple[Trace, .
     raise KeyError(name)
 
 
-def telling_variables(rows: LinearisedData, c: Calibration) -> tuple[Trace, ...]:
+def telling_variables(rows: LinearisedData, c: Calibration, of_direction: bool = False) -> tuple[Trace, ...]:
     """What the model ``c`` leaves, against the `PANELS` variables that tell most
-    of it.
+    of it; ``of_direction``: the readings of the axes before any other.
 
     The measure is the adjusted share of the weighted sum of squares that a
     smooth curve in the variable takes away beside the nine parameters: 1 less
@@ -145,7 +145,7 @@ def telling_variables(rows: LinearisedData, c: Calibration) -> tuple[Trace, ...]
     """
     data = _Data.of(rows, c).of_means()
     found = [fit for drivers in data.candidates() if drivers and (fit := data.fitted(drivers)) is not None]
-    best = sorted(found, key=lambda fit: -fit.share)[:PANELS]
+    best = sorted(found, key=lambda fit: (of_direction and not fit.of_reading, -fit.share))[:PANELS]
     return tuple(data.trace_of_curve(fit, min(1.0, fit.p_value * len(found))) for fit in best)
 
 
@@ -227,6 +227,10 @@ class _Curve:
     coefficients: _Coefficients
     share: float
     p_value: float
+
+    @property
+    def of_reading(self) -> bool:
+        return self.drivers[0].variable in READINGS
 
 
 @dataclass(frozen=True, eq=False)

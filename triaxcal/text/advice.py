@@ -125,7 +125,7 @@ def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     if beside := [_beside(action) for action in actions if action.kind in (ActionKind.LOG, ActionKind.HOLD)]:
         yield "; ".join(beside)
     if poses := [_pose(action, loop) for action in actions if action.kind not in (ActionKind.LOG, ActionKind.HOLD)]:
-        yield f"record next, in this order: {', then '.join(poses)}"
+        yield f"record next, to tell what acts, in this order: {', then '.join(poses)}"
     if loop.too_uncertain:
         following = loop.next_recording
         start, whole = small.in_full(following.start_to_start), small.in_full(following.standard)
@@ -142,9 +142,9 @@ def _beside(action: Action) -> str:
 
 
 def _pose(action: Action, loop: Loop) -> str:
-    again = None if action.repeat_of is None else moment(loop.after.poses[action.repeat_of].pose.began)
-    where = _direction(action)
-    pose = where if again is None else f"{where} as at {again}"
+    pose, again = _direction(action), action.repeat_of
+    if again is not None:
+        pose = f"{pose} again (as pose {again + 1} at {moment(loop.after.poses[again].pose.began)})"
     if action.kind is ActionKind.CHANNEL:
         return f"{pose} with {action.channel} moved by {plain(action.by, sign='+')} and settled"
     return f"{pose} after {action.pause_s:.0f} s of rest" if action.kind is ActionKind.PAUSE else pose

@@ -30,10 +30,10 @@ class Scopes:
     @classmethod
     def of(cls, c: Calibration, budget: Budget, following: NextRecording) -> Scopes:
         """A pose that the fit has not seen is as far off as the cross-validated
-        ones, or by its noise and the fit where nobody asked."""
+        ones, and by no less than what the fit and its residuals make."""
         standard, k = float(budget.magnitude.standard), float(budget.magnitude.coverage)
         crossed = c.residual.cross_validated_rms_g
-        pose = float(np.hypot(standard, c.residual.rms_g)) if crossed is None else crossed
+        pose = max(float(np.hypot(standard, c.residual.rms_g)), crossed or 0.0)
         return cls(float(budget.magnitude.expanded), k * pose, following.expanded_uncertainty)
 
     @property
