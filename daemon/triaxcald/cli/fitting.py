@@ -12,6 +12,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.interchange.calibration_document import Document, calibration_document
+from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
 from triaxcal.model.moment import Moment
 from triaxcal.pooled_units import pooled_analysis
 from triaxcal.poses.pose import Pose
@@ -37,7 +38,6 @@ from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured
-from triaxcald.several import agreement_document, with_recordings
 
 
 def fit_command(a: argparse.Namespace) -> int:

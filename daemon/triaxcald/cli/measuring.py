@@ -14,6 +14,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import magnitude_errors
+from triaxcal.estimate.unit_identity import shape_beside, shape_in, unlike_shapes
 from triaxcal.interchange.calibration_document import poses_document
 from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.rounding import error
@@ -22,7 +23,6 @@ from triaxcald.cli.console import emit, show
 from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, read_document
-from triaxcald.same_unit import shape_beside, shape_in, unlike_shapes
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 

@@ -4,21 +4,24 @@ datasheet values."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
-from triaxcal.inputs.datasheet import Refinement, refine
+from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
 from triaxcal.interchange.calibration_document import Document
+from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
+from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.interchange.method_documents import attitudes_document, datasheet_document, turning_document
 from triaxcal.number_format import number_of, probability
-from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, show, table
 from triaxcald.cli.results import cross_validated, held_at, show_coefficients, temperature_of
@@ -79,7 +82,7 @@ def _turning(a: argparse.Namespace) -> Way:
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
-    document = methods.turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     calibration = found.calibration
     still = [p for p in measured.poses if not p.creep.any()]
     if len(still) >= POSES_ENOUGH:
@@ -115,7 +118,7 @@ def _attitudes(a: argparse.Namespace) -> Way:
             reference=choice.reference,
             attitude_error_rad=a.attitude_error,
         )
-    document = methods.attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
 
 
@@ -167,7 +170,7 @@ def _datasheet(a: argparse.Namespace) -> Way:
     require_unit(held, measured, where=a.datasheet)
     choice = chosen(a, measured)
     said = a.reference or measured.reference or getattr(a, "latitude", None)
-    datasheet, units = methods.read_datasheet(
+    datasheet, units = read_datasheet(
         held, where=a.datasheet, errors=a.datasheet_error, reference=choice.reference if said is not None else None
     )
     if a.sign and any(k * s < 0 for k, s in zip(datasheet.sensor.scale_factor, a.sign, strict=True)):
@@ -180,8 +183,44 @@ def _datasheet(a: argparse.Namespace) -> Way:
     )
     with telling_data_quality(measured), np.errstate(all="ignore"):  # numbers out of a file may be any
         found = refine(measured.poses, datasheet)
-    document = methods.datasheet_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = datasheet_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_datasheet(found, choice)
+
+
+def read_datasheet(
+    document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
+) -> tuple[Datasheet, Mapping[str, str]]:
+    """The datasheet values in a calibration, loop or certificate document, and
+    its units.
+
+    ``errors`` stand for the document's, and for its correlation: of the scale
+    factors relative to them, of the misalignments in rad, of the biases in the
+    unit of the reference. ``reference`` is the magnitude in the poses, where it
+    is not the document's. Raises InputError.
+    """
+    sensor, channel_reference, own = sensor_of(document, where=where)
+    part = calibration_part(document, where=where)
+    if reference is not None and not 0.9 < reference / own < 1.1:
+        raise InputError(f"--reference {reference:g}: {where} was made for {own:g}, in another unit it seems")
+    if errors is not None:
+        relative, angle, bias = errors
+        linear = np.concatenate([np.abs(sensor.scale_factor) * relative, np.full(3, angle), np.full(3, bias)])
+        correlation = None
+    elif "standard_error" not in part:
+        raise InputError(f"{where}: standard_error: missing; expected them, or --datasheet-error")
+    else:
+        linear = linear_errors_of(part, where=where)
+        correlation = correlation_of(part, sensor, where=where)
+    standard_error = np.concatenate([linear, effect_errors_of(part, sensor, where=where)])
+    if not np.any(standard_error > 0):
+        whose = f"{where}: standard_error" if errors is None else "--datasheet-error"
+        raise InputError(f"{whose}: all are 0, so that nothing is left to refine")
+    units = part.get("units")
+    held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
+    magnitude = own if reference is None else reference
+    return Datasheet(
+        sensor, standard_error, channel_reference, magnitude, correlation, holds_at_of(part, where=where)
+    ), held
 
 
 def _show_datasheet(found: Refinement, choice: Choice) -> None:

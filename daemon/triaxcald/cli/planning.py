@@ -24,14 +24,13 @@ from triaxcal.model.directions import (
     linear_design,
     worst_error,
 )
-from triaxcal.planning.addition import Addition
+from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
 from triaxcal.planning.clock import in_plan
 from triaxcal.planning.design import Asked, ask, needs_time
 from triaxcal.planning.optimal import OptimalPlan, optimal
 from triaxcal.planning.visibility import Sight, sight, unseen_effects
 from triaxcal.rounding import number, numbers, uncertainty
 from triaxcald.cli.console import emit, say, show, table
-from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
 
@@ -220,7 +219,7 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
     choice = chosen(a, measured)
     had = [p for p in measured.poses if not p.fault]
     with telling_data_quality(measured):
-        found = lacking(had, effects, signs=choice.signs, reference=choice.reference)
+        found = missing_poses(had, effects, signs=choice.signs, reference=choice.reference)
     sights = None if found.had is None else {e.name: sight(found.had.up, e) for e in CATALOGUE}
     document: Document = {
         "format": "triaxcal.plan/1",
@@ -264,7 +263,7 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
     return 0
 
 
-def _added(found: Lacking, pose: Addition) -> Document:
+def _added(found: MissingPoses, pose: Addition) -> Document:
     noise = found.noise
     out: Document = {
         "label": pose.label,
@@ -287,7 +286,7 @@ def _of_all(
     return {e.name: errors.get(e.name) or dict.fromkeys(c.name for c in e.coefficients) for e in effects}
 
 
-def _not_shown(found: Lacking, effects: Sequence[Effect]) -> dict[str, str]:
+def _not_shown(found: MissingPoses, effects: Sequence[Effect]) -> dict[str, str]:
     """In words, by effect: what of it the poses there cannot show, and whether
     the poses to add do."""
     out = {}
@@ -309,7 +308,7 @@ def _not_shown(found: Lacking, effects: Sequence[Effect]) -> dict[str, str]:
     return out
 
 
-def _show_wanted(title: str, found: Lacking) -> None:
+def _show_wanted(title: str, found: MissingPoses) -> None:
     channels = list(found.wanted[0].levels)
     rows = [
         [

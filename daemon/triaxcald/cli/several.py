@@ -12,6 +12,7 @@ from pathlib import Path
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
 from triaxcal.estimate.recordings import residuals_by_run, together
+from triaxcal.estimate.unit_identity import shape_by_poses, shape_of, unlike_shapes
 from triaxcal.number_format import plain
 from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
@@ -21,7 +22,6 @@ from triaxcald.cli.results import WORTH_A_LINE, chance_of
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
-from triaxcald.same_unit import shape_by_poses, shape_of, unlike_shapes
 from triaxcald.verification import unlike
 
 COLUMNS = {

@@ -1,18 +1,14 @@
-"""Calibrations that come by other ways than still poses of unknown attitude:
-their documents, and datasheets as read.
+"""Documents of calibrations by other methods than still poses of unknown
+attitude.
 
-All are `triaxcal.calibration/1`, with what the way adds under a key of its own.
+All are `triaxcal.calibration/1`, with what the method adds under a key of its
+own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-
 from triaxcal.inputs.attitude import AttitudeFit
-from triaxcal.inputs.datasheet import Datasheet, Refinement
+from triaxcal.inputs.datasheet import Refinement
 from triaxcal.inputs.turning.rotation import RotationFit
 from triaxcal.interchange.calibration_document import (
     LINEAR,
@@ -21,10 +17,7 @@ from triaxcal.interchange.calibration_document import (
     calibration_document,
     residual_document,
 )
-from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
-from triaxcald.errors import InputError
 
 
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
@@ -98,39 +91,3 @@ def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: s
         "source": by_parameter(c, found.sources),
     }
     return document
-
-
-def read_datasheet(
-    document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
-) -> tuple[Datasheet, Mapping[str, str]]:
-    """The datasheet values in a calibration, loop or certificate document, and
-    its units.
-
-    ``errors`` stand for the document's, and for its correlation: of the scale
-    factors relative to them, of the misalignments in rad, of the biases in the
-    unit of the reference. ``reference`` is the magnitude in the poses, where it
-    is not the document's. Raises InputError.
-    """
-    sensor, channel_reference, own = sensor_of(document, where=where)
-    part = calibration_part(document, where=where)
-    if reference is not None and not 0.9 < reference / own < 1.1:
-        raise InputError(f"--reference {reference:g}: {where} was made for {own:g}, in another unit it seems")
-    if errors is not None:
-        relative, angle, bias = errors
-        linear = np.concatenate([np.abs(sensor.scale_factor) * relative, np.full(3, angle), np.full(3, bias)])
-        correlation = None
-    elif "standard_error" not in part:
-        raise InputError(f"{where}: standard_error: missing; expected them, or --datasheet-error")
-    else:
-        linear = linear_errors_of(part, where=where)
-        correlation = correlation_of(part, sensor, where=where)
-    standard_error = np.concatenate([linear, effect_errors_of(part, sensor, where=where)])
-    if not np.any(standard_error > 0):
-        whose = f"{where}: standard_error" if errors is None else "--datasheet-error"
-        raise InputError(f"{whose}: all are 0, so that nothing is left to refine")
-    units = part.get("units")
-    held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
-    magnitude = own if reference is None else reference
-    return Datasheet(
-        sensor, standard_error, channel_reference, magnitude, correlation, holds_at_of(part, where=where)
-    ), held

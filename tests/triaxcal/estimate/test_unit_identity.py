@@ -10,11 +10,11 @@ import pytest
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.estimate.unit_identity import Shape, shape_beside, shape_by_poses, shape_in, shape_of, unlike_shapes
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
-from triaxcald.same_unit import Shape, shape_beside, shape_by_poses, shape_in, shape_of, unlike_shapes
 
 KNOWN = 1e-5
 """Standard error of scale factors, as a share, and of misalignments [rad]."""

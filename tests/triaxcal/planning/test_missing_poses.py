@@ -11,10 +11,10 @@ from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import closed, directions
 from triaxcal.model.sensor import Sensor
+from triaxcal.planning.addition import MissingPoses, missing_poses
 from triaxcal.planning.clock import in_plan
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
-from triaxcald.cli.lacking import Lacking, lacking
 
 ERROR_G = 1e-5
 RECORDINGS, RUNS = 5, 60
@@ -37,7 +37,7 @@ class Unit:
         )
         self.whole_g = float(np.hypot(ERROR_G, comes_back_g))
 
-    def poses(self, added: Lacking | None = None) -> list[Pose]:
+    def poses(self, added: MissingPoses | None = None) -> list[Pose]:
         """Of a recording, and of that with the poses which a plan wants of it. The noise known is `ERROR_G` alone."""
         more = added.wanted if added else []
         low, high = self.temperature.min(), self.temperature.max()
@@ -52,10 +52,10 @@ class Unit:
         )
         return [replace(p, covariance=p.covariance * (ERROR_G / self.whole_g) ** 2) for p in poses]
 
-    def planned(self) -> Lacking:
-        return lacking(self.poses(), [in_plan(self.effect)], signs=(1, 1, 1), reference=1.0)
+    def planned(self) -> MissingPoses:
+        return missing_poses(self.poses(), [in_plan(self.effect)], signs=(1, 1, 1), reference=1.0)
 
-    def scatter_over(self, plan: Lacking) -> np.ndarray:
+    def scatter_over(self, plan: MissingPoses) -> np.ndarray:
         """Of the coefficients, when the poses planned are taken and fitted with the effect, over those promised."""
         promised = (plan.wanted[-1].errors if plan.wanted else plan.now)[self.effect.name]
         found = [
