@@ -28,9 +28,9 @@ from triaxcal.model.directions import FULL, closed, directions
 from triaxcal.model.moment import Moment
 from triaxcal.model.samples import Samples
 from triaxcal.number_format import number_of
-from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.poses.quality import QualityDetector, disturbances, untrusted_poses
-from triaxcal.poses.stillness.detector import StillnessDetector
+from triaxcal.poses.finder import PoseFinder
+from triaxcal.poses.pose import Pose
+from triaxcal.poses.quality import disturbances
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
@@ -185,15 +185,13 @@ def find_poses(
     into a DataFrame, by whatever reads it. Raises InvalidData.
     """
     samples = _samples(t, u, channels, time_unit, columns)
-    detector, judge = StillnessDetector(), QualityDetector()
-    detector.feed(samples.time_ns, samples.readings, samples.channels)
-    detector.finish()
-    windows, spans = detector.windows(), detector.spans()
-    judge.feed(samples.time_ns, samples.readings)
-    judge.finish()
-    posterior = judge.findings(windows, spans)
-    found = Poses(poses_of(windows, spans, untrusted_poses(posterior)) if windows is not None else ())
-    found.data_quality = tuple(text.quality_line(f, output_unit) for f in (*posterior, *disturbances(found)))
+    finder = PoseFinder()
+    finder.feed(samples.time_ns, samples.readings, samples.channels)
+    finder.finish()
+    if finder.windows is None and (too_short := finder.too_short()) is not None:
+        raise too_short
+    found = Poses(finder.poses())
+    found.data_quality = tuple(text.quality_line(f, output_unit) for f in (*finder.findings(), *disturbances(found)))
     found.output_unit = output_unit
     return found
 

@@ -19,9 +19,9 @@ from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.model.moment import Moment
 from triaxcal.number_format import number_of
-from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.poses.quality import QualityDetector, untrusted_poses
-from triaxcal.poses.stillness.detector import StillnessDetector, Windows
+from triaxcal.poses.finder import PoseFinder
+from triaxcal.poses.pose import Pose
+from triaxcal.poses.stillness.detector import Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
 from triaxcal_drivers.file_kind import special_kind
@@ -103,27 +103,26 @@ def measure(
     samples = table.samples
     if reading is not None and reading.pose_means:
         return _of_means(name, table)
-    detector, judge = StillnessDetector(), QualityDetector()
+    finder = PoseFinder()
     try:
-        detector.feed(samples.time_ns, samples.readings, samples.channels)
-        detector.finish()
-        windows = detector.windows()
-        judge.feed(samples.time_ns, samples.readings)
-        judge.finish()
+        finder.feed(samples.time_ns, samples.readings, samples.channels)
+        finder.finish()
+        if finder.windows is None and (too_short := finder.too_short()) is not None:
+            raise too_short
         if moments is not None:
             moments.feed(samples.readings, samples.channels.get(TEMPERATURE))
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
     read = Measured(
-        name, [], windows, [], output_unit=table.output_unit, remarks=table.remarks, too_short=detector.too_short()
+        name, [], finder.windows, [], output_unit=table.output_unit, remarks=table.remarks, too_short=finder.too_short()
     )
 
     def parted(turn_s: float | None) -> Measured:
-        spans = detector.spans(turn_s)
-        seen = judge.findings(windows, spans)
-        poses = poses_of(windows, spans, untrusted_poses(seen))
-        quality = together(counted, seen) + ([] if moments is not None else of_poses(poses, table.output_unit))
+        finder.part_by(turn_s)
+        poses = finder.poses()
+        quality = together(counted, finder.findings())
+        quality += [] if moments is not None else of_poses(poses, table.output_unit)
         return replace(read, poses=poses, data_quality=quality, parted=parted)
 
     return parted(turn_s)

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal import text
-from triaxcal.errors import InvalidData, TooShort
+from triaxcal.errors import TooShort
 from triaxcal.number_format import number_of
-from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
-from triaxcal.poses.quality import Finding, QualityDetector, disturbances, untrusted_poses
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.finder import PoseFinder
+from triaxcal.poses.pose import Pose, StillSpan
+from triaxcal.poses.quality import Finding, disturbances
+from triaxcal.poses.stillness.detector import Windows
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
@@ -31,16 +32,11 @@ class Pipeline(DecodedStream):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._detector = StillnessDetector()
-        self._quality = QualityDetector()
-        self._spans: tuple[int, list[Span]] = (0, [])
-        self._findings: list[Finding] | None = None
+        self._finder = PoseFinder(self.turn_s)
 
     def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
-        self._findings = None
-        time_ns, readings = block.time_ns[fresh], block.readings[fresh]
-        self._detector.feed(time_ns, readings, {n: v[fresh] for n, v in block.channels.items()})
-        self._quality.feed(time_ns, readings)
+        channels = {n: v[fresh] for n, v in block.channels.items()}
+        self._finder.feed(block.time_ns[fresh], block.readings[fresh], channels)
 
     def feed_all(self, batches: Iterable[RawBatch]) -> Pipeline:
         for batch in batches:
@@ -50,31 +46,20 @@ class Pipeline(DecodedStream):
     @property
     def windows(self) -> Windows | None:
         """Summaries of the stream so far; None while there are none."""
-        try:
-            return self._detector.windows()
-        except InvalidData:
-            return None
+        return self._finder.windows
 
     def too_short(self) -> TooShort | None:
         """Why no pose could be found so far, whatever the unit did."""
-        return self._detector.too_short()
+        return self._finder.too_short()
 
     def poses(self) -> list[Pose]:
-        """The still poses so far."""
-        windows = self.windows
-        return [] if windows is None else poses_of(windows, self._still(windows))
+        """The still poses so far, whether their samples are faulty or not."""
+        return self._finder.poses(judged=False)
 
     def held(self) -> list[StillSpan]:
         """The same without their noise, which takes longer than all the rest:
         enough to guide an operator by."""
-        windows = self.windows
-        return [] if windows is None else still_spans_of(windows, self._still(windows))
-
-    def _still(self, windows: Windows) -> list[Span]:
-        """The still spans so far, found once for the same windows."""
-        if self._spans[0] != len(windows):
-            self._spans = (len(windows), self._detector.spans(self.turn_s))
-        return self._spans[1]
+        return self._finder.still_spans()
 
     def finish(self) -> list[Pose]:
         """The still poses of the whole stream."""
@@ -83,15 +68,13 @@ class Pipeline(DecodedStream):
 
     def close(self) -> None:
         """No more records come."""
-        self._detector.finish()
-        self._quality.finish()
+        self._finder.finish()
 
     def parted(self, turn_s: float | None) -> list[Pose]:
         """The still poses of the whole stream once that is closed, for another
         ``turn_s``."""
-        self.turn_s, self._spans, self._findings = turn_s, (0, []), None
-        windows = self.windows
-        return [] if windows is None else poses_of(windows, self._still(windows), untrusted_poses(self._seen(windows)))
+        self._finder.part_by(turn_s)
+        return self._finder.poses()
 
     def data_quality(self) -> list[str]:
         """What the raw stream is to be blamed for, one line each."""
@@ -120,7 +103,7 @@ class Pipeline(DecodedStream):
             found["bus_errors"] = number_of(self.counts["errors"], "record")
         if absurd := self._implausible():
             found["implausible_readings"] = absurd
-        return together(found, self._seen(self.windows), self.output_unit)
+        return together(found, self._finder.findings(), self.output_unit)
 
     @property
     def output_unit(self) -> str:
@@ -132,7 +115,7 @@ class Pipeline(DecodedStream):
         empty."""
         nominal = self.bundle.profile.output.nominal_scale_factor
         windows = self.windows
-        spans = [] if windows is None else self._still(windows)
+        spans = self._finder.spans()
         if windows is None or not spans or nominal is None or self.stream != READINGS:
             return ""
         means = np.array([windows.mean[s.used].mean(axis=0) for s in spans])
@@ -144,12 +127,6 @@ class Pipeline(DecodedStream):
             f"by output.nominal_scale_factor the poses span ±{half_g[axis]:.3g} g in {'xyz'[axis]}, and gravity has "
             "±1 g; does the profile decode the readings as the unit sends them?"
         )
-
-    def _seen(self, windows: Windows | None) -> list[Finding]:
-        """The findings so far, judged once for the same samples."""
-        if self._findings is None:
-            self._findings = self._quality.findings(windows, self._still(windows) if windows else [])
-        return self._findings
 
 
 def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = "") -> list[str]:

@@ -1,0 +1,86 @@
+"""From samples to still poses, as the samples come."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from triaxcal.errors import InvalidData, TooShort
+from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
+from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
+from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+
+
+class PoseFinder:
+    """Finds the still poses of a stream, and what is wrong with its samples.
+
+    The blocks may have any size: the result is that of the whole. ``turn_s`` is
+    how long a turn in place takes, where the unit may turn so, as for
+    `triaxcal.poses.stillness.find_spans`.
+    """
+
+    def __init__(self, turn_s: float | None = None) -> None:
+        self._turn_s = turn_s
+        self._stillness = StillnessDetector()
+        self._quality = QualityDetector()
+        self._spans: tuple[int, list[Span]] = (0, [])
+        self._findings: list[Finding] | None = None
+
+    def feed(self, time_ns: Any, readings: Any, channels: Mapping[str, Any] | None = None) -> None:
+        """Times (n,) in nanoseconds, readings (n,3), and channels (n,) each by
+        name. Raises InvalidData where they are of other shapes, where times do
+        not increase, or where readings are not finite."""
+        self._findings = None
+        self._stillness.feed(time_ns, readings, channels or {})
+        self._quality.feed(time_ns, readings)
+
+    def finish(self) -> None:
+        """No more samples come."""
+        self._stillness.finish()
+        self._quality.finish()
+
+    def part_by(self, turn_s: float | None) -> None:
+        """Take the poses apart for another ``turn_s`` from now on."""
+        self._turn_s, self._spans, self._findings = turn_s, (0, []), None
+
+    @property
+    def windows(self) -> Windows | None:
+        """Summaries of the stream so far; None while there are none."""
+        try:
+            return self._stillness.windows()
+        except InvalidData:
+            return None
+
+    def too_short(self) -> TooShort | None:
+        """Why no pose could be found so far, whatever the unit did."""
+        return self._stillness.too_short()
+
+    def still_spans(self) -> list[StillSpan]:
+        """The poses so far without their noise, which takes longer than all the
+        rest."""
+        windows = self.windows
+        return [] if windows is None else still_spans_of(windows, self.spans())
+
+    def poses(self, *, judged: bool = True) -> list[Pose]:
+        """The poses so far. Those whose samples are faulty name the fault, and
+        tell nothing of the noise of the others, unless ``judged`` is false."""
+        windows = self.windows
+        if windows is None:
+            return []
+        return poses_of(windows, self.spans(), untrusted_poses(self.findings()) if judged else None)
+
+    def spans(self) -> list[Span]:
+        """The still spans so far, found once for the same windows."""
+        windows = self.windows
+        if windows is None:
+            return []
+        if self._spans[0] != len(windows):
+            self._spans = (len(windows), self._stillness.spans(self._turn_s))
+        return self._spans[1]
+
+    def findings(self) -> list[Finding]:
+        """What is wrong with the samples so far, judged once for the same
+        samples."""
+        if self._findings is None:
+            self._findings = self._quality.findings(self.windows, self.spans())
+        return self._findings
