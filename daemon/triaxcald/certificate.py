@@ -20,7 +20,7 @@ from triaxcal import text
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
-from triaxcal.effects.in_run import of_clocks
+from triaxcal.effects.runs import of_clocks
 from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.estimate.projected_calibration import Reduced, reduced
 from triaxcal.inputs.bias_update import Earlier, updated_biases

@@ -8,7 +8,7 @@ from pathlib import Path
 from triaxcal.effects import CATALOGUE, effect_named
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR
 from triaxcal.effects.contract import BEFORE, CHANGE, CLOCKS, RUN, SCATTER, Coefficient, Effect, lag_in, rate_of
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.runs import BETWEEN_RUNS
 
 PAGE = Path(__file__).with_suffix(".md")
 NAME = "NAME"

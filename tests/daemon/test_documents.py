@@ -12,8 +12,7 @@ import pytest
 
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
-from triaxcal.effects.bias_step import BiasStep
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.time import BiasStep, WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit

@@ -16,9 +16,9 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.effects import CATALOGUE, Effect
-from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, is_derived
+from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, Residual
 from triaxcal.estimate.pose_fit import fit

@@ -17,10 +17,7 @@ import pytest
 import triaxcal.effects
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_named, effect_of
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
-from triaxcal.effects.compression import Compression
 from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
@@ -37,10 +34,11 @@ from triaxcal.effects.contract import (
     lag_of,
     rate_of,
 )
-from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.memory import Hysteresis
+from triaxcal.effects.nonlinear import Compression
 from triaxcal.effects.plugins import plugins
-from triaxcal.effects.temperature_lag import TemperatureLag
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.thermal import TemperatureLag
+from triaxcal.effects.time import BiasDrift, BiasStep, WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor

@@ -10,9 +10,7 @@ import pytest
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, Verdict, diagnose
 from triaxcal.effects import Effect, effect_named
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.bias_step import BiasStep
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.time import BiasDrift, BiasStep, WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.model.directions import directions
 from triaxcal.pooled_units import Answer, PooledAnalysis, PooledEffect, pooled_analysis

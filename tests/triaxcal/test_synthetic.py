@@ -9,13 +9,9 @@ import pytest
 from scipy import stats
 
 from triaxcal.effects import TIME, Effect
-from triaxcal.effects.bias_step import BiasStep
-from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.effects.remanence import Remanence
-from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
-from triaxcal.effects.temperature_lag import TemperatureLag
-from triaxcal.effects.thermal_gradient import ThermalGradient
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.memory import Hysteresis, Remanence
+from triaxcal.effects.thermal import TemperatureLag, ThermalGradient
+from triaxcal.effects.time import BiasStep, ScaleFactorDrift, WarmUp
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import STANDARD_GRAVITY, Environment, SyntheticUnit, Tumble, noisy_poses
 

@@ -12,9 +12,8 @@ from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, channel_of, is_derived
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.in_run import InRuns, runs_named
 from triaxcal.effects.plugins import plugins
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, runs_named
 
 TEMPERATURE = "temp_c"
 OWN: tuple[Effect, ...] = (*CATALOGUE, *BETWEEN_RUNS, Empirical())

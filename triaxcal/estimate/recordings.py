@@ -15,8 +15,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import RUN, Effect
-from triaxcal.effects.in_run import InRuns, longest, of_clocks
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, longest, of_clocks
 from triaxcal.effects.wrapped import Wrapped
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration

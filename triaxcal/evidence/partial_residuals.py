@@ -35,8 +35,8 @@ from triaxcal.effects.contract import (
     lag_in,
     rate_of,
 )
-from triaxcal.effects.in_run import runs_named
 from triaxcal.effects.plugins import EffectFault
+from triaxcal.effects.runs import runs_named
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.evidence.linearised_data import LinearisedData

@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
-from triaxcal.effects.in_run import of_clocks
+from triaxcal.effects.runs import of_clocks
 from triaxcal.effects.wrapped import Wrapped
 from triaxcal.model.directions import FULL
 

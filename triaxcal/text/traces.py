@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from triaxcal.effects.contract import BEFORE, CHANGE, RUN, SCATTER, SINCE_START, TIME, channel_of, lag_in, rate_of
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.in_run import runs_named
+from triaxcal.effects.runs import runs_named
 from triaxcal.evidence.partial_residuals import POSE, PREDICTED, READINGS, Quantity, Trace, unit_of
 from triaxcal.units import ErrorUnit, in_units_of
 

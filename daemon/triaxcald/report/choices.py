@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.runs import BETWEEN_RUNS
 from triaxcald.choices import HOST, PROCESS, REGISTERS
 from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.figures import effect_title

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.effects import effect_named
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.runs import BETWEEN_RUNS
 from triaxcald.choices import is_passing
 from triaxcald.report.figures import number
 from triaxcald.report.untrusted import mapping, texts

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
+from triaxcal.effects.nonlinear import ThirdOrderNonlinearity
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning import directions
 from triaxcal.rounding import concise

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import CATALOGUE, effect_named
-from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, LAGS_S, RUN, SCATTER, SINCE_START, Effect, lag_of
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.effects.in_run import InRuns
-from triaxcal.effects.run_bias import RunBias, RunScaleFactor
+from triaxcal.effects.memory import Hysteresis
+from triaxcal.effects.runs import InRuns, RunBias, RunScaleFactor
+from triaxcal.effects.time import BiasDrift
 from triaxcald.report.meanings import factor, in_plain, told
 
 FORMS = [form for effect in (*CATALOGUE, effect_named("channel_bias:fan rpm")) for form in effect.forms]

@@ -10,8 +10,8 @@ import pytest
 
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_of
-from triaxcal.effects.compression import KINDS, KNEES, Compression
 from triaxcal.effects.contract import BEFORE
+from triaxcal.effects.nonlinear import KINDS, KNEES, Compression
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.directions import directions

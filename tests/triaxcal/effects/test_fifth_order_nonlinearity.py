@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
-from triaxcal.effects.fifth_order_nonlinearity import FifthOrderNonlinearity
+from triaxcal.effects.nonlinear import FifthOrderNonlinearity
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.directions import directions, linear_design

@@ -11,8 +11,7 @@ import pytest
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.contract import BEFORE
-from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.effects.remanence import Remanence
+from triaxcal.effects.memory import Hysteresis, Remanence
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why

@@ -9,8 +9,7 @@ import pytest
 
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
+from triaxcal.effects.time import BiasDrift, ScaleFactorDrift
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor

@@ -12,7 +12,7 @@ import pytest
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.contract import LAGS_S, RUN, SINCE_START, lag_in, lag_of
-from triaxcal.effects.temperature_lag import TemperatureLag
+from triaxcal.effects.thermal import TemperatureLag
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.pose_fit import fit

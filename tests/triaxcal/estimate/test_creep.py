@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.diagnosis import Verdict, diagnose
 from triaxcal.effects import effect_named
-from triaxcal.effects.bias_drift import BiasDrift
+from triaxcal.effects.time import BiasDrift
 from triaxcal.estimate.creep import with_unexplained_creep, without_creep
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor

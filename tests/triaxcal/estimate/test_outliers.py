@@ -11,7 +11,7 @@ from scipy import stats
 
 from benchmarks.outliers import clean_loses, measure
 from benchmarks.truth import plan
-from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.memory import Hysteresis
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.caution import (
     Caution,

@@ -12,12 +12,9 @@ from scipy import stats
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import CATALOGUE, Effect, effect_named, effect_of
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.contract import DURATION, RUN, SINCE_START, TIME
-from triaxcal.effects.in_run import InRuns
-from triaxcal.effects.run_bias import RunBias
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.runs import InRuns, RunBias
+from triaxcal.effects.time import BiasDrift, BiasStep, WarmUp
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import solve

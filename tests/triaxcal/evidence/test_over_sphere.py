@@ -12,7 +12,7 @@ from tests.triaxcal.evidence.conftest import FEW, MINUS
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
-from triaxcal.effects.cross_coupling import CrossCoupling
+from triaxcal.effects.nonlinear import CrossCoupling
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.projected_calibration import reduced

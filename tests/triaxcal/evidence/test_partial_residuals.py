@@ -11,8 +11,8 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import SINCE_START, TIME, Coefficient, Effect, no_slope
-from triaxcal.effects.cross_coupling import CrossCoupling
 from triaxcal.effects.empirical import Empirical
+from triaxcal.effects.nonlinear import CrossCoupling
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.recordings import together
@@ -265,7 +265,7 @@ def test_residuals_are_in_standard_errors_of_their_poses(poses_with: Poses) -> N
 
 
 def test_an_effect_of_one_of_several_recordings_is_drawn_over_that_one(poses_with: Poses) -> None:
-    from triaxcal.effects.in_run import InRuns
+    from triaxcal.effects.runs import InRuns
 
     effect = InRuns(effect_named("bias_drift"), (1,))
     poses = together([poses_with(1), poses_with(2, bias_drift=[6e-6, -6e-6, 6e-6])])

@@ -8,7 +8,7 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.arrays import Floats
 from triaxcal.effects import effect_named
-from triaxcal.effects.bias_step import MOMENTS
+from triaxcal.effects.time import MOMENTS
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.evidence.posterior import Posterior

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from triaxcal.diagnosis import diagnose
-from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.channel import ChannelBias
 from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, RUN, SCATTER, SINCE_START, TIME
-from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.effects.temperature_bias import TemperatureBias
+from triaxcal.effects.memory import Hysteresis
+from triaxcal.effects.thermal import TemperatureBias
+from triaxcal.effects.time import BiasDrift
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor

@@ -6,20 +6,13 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import CATALOGUE
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias
 from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, RUN, SCATTER, SINCE_START, TIME, Effect
-from triaxcal.effects.cross_coupling import CrossCoupling
-from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.effects.in_run import InRuns
-from triaxcal.effects.run_bias import RunBias
-from triaxcal.effects.temperature_bias import TemperatureBias
-from triaxcal.effects.temperature_lag import TemperatureLag
-from triaxcal.effects.temperature_scale_factor import TemperatureScaleFactor
-from triaxcal.effects.thermal_gradient import ThermalGradient
-from triaxcal.effects.vibration_rectification import VibrationRectification
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.memory import Hysteresis
+from triaxcal.effects.nonlinear import CrossCoupling, VibrationRectification
+from triaxcal.effects.runs import InRuns, RunBias
+from triaxcal.effects.thermal import TemperatureBias, TemperatureLag, TemperatureScaleFactor, ThermalGradient
+from triaxcal.effects.time import BiasDrift, BiasStep, WarmUp
 from triaxcal.text import holds, use
 
 S = np.array([[0.6, -0.64, 0.48], [0.0, 0.8, -0.6]])

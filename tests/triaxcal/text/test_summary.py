@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.temperature_bias import TemperatureBias
-from triaxcal.effects.warm_up import WarmUp
+from triaxcal.effects.thermal import TemperatureBias
+from triaxcal.effects.time import WarmUp
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.text import summary, verification
