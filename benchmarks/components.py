@@ -30,7 +30,7 @@ from triaxcal.distributions import t_ppf
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.readings import uncertainty_of_magnitude, uncertainty_of_readings
+from triaxcal.uncertainty.propagation import uncertainty_of_magnitude, uncertainty_of_readings
 
 KINDS = {"tuned": further.TUNED, "held-back": further.HELD_BACK, "catalogue": physics.KINDS, "none": ("none",)}
 FIRST = {"tuned": 0, "held-back": 705_000, "catalogue": 710_000, "none": 720_000}

@@ -17,9 +17,9 @@ from benchmarks.pages import DOCS, PICTURES, write
 from benchmarks.pictures import draw
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
-from triaxcal.estimate.caution import HighLeverage, PoorSpread
+from triaxcal.estimate.calibration import HighLeverage, PoorSpread
 from triaxcal.text import caution
-from triaxcal.text.diagnosis import chance
+from triaxcal.text.advice import chance
 from triaxcald.inputs import Measured, measure
 from triaxcald.tables.own_text import read_csv
 

@@ -13,8 +13,7 @@ from scipy.optimize import least_squares
 
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, plan
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.caution import OutlierSetsTied
+from triaxcal.estimate.calibration import Calibration, OutlierSetsTied
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import linear_design
 from triaxcal.poses.pose import Pose

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, bound_and_best, hard, plan
-from triaxcal.estimate.ellipsoid import closed_form, coefficients
+from triaxcal.estimate.initial_estimate import closed_form, coefficients
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

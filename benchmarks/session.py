@@ -26,7 +26,7 @@ from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.estimate.recordings import together
 from triaxcal.pooled_units import PooledEffect, pooled_analysis
-from triaxcal.text.diagnosis import chance
+from triaxcal.text.advice import chance
 from triaxcal.text.pooled_units import verdict
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import next_recording

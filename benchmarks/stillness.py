@@ -20,7 +20,8 @@ import numpy as np
 from benchmarks.streams import COVARIATES, PAPER_UNIT, Condition, Stream, made
 from triaxcal.arrays import Floats
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 
 HEAD = (
     f"{'condition':36} {'true':>5} {'found':>5} {'split':>5} {'merged':>6} {'invented':>8} {'missed':>6} "

@@ -25,8 +25,7 @@ from triaxcal.evidence.partial_residuals import Trace
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
-from triaxcal.model.moment import Moment
-from triaxcal.model.samples import Samples
+from triaxcal.model.samples import Moment, Samples
 from triaxcal.number_format import number_of
 from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose

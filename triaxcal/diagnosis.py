@@ -19,17 +19,16 @@ from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.corrected_calibration import corrected
-from triaxcal.evidence.findings import Findings, Named, findings, stated
-from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
-from triaxcal.evidence.information_gain import Advice, advice, decided
+from triaxcal.evidence.findings import Findings, Named, NotIdentifiable, findings, not_identifiable, stated
 from triaxcal.evidence.model_average import Refusal, average
+from triaxcal.evidence.next_measurement import Advice, advice, decided
 from triaxcal.evidence.over_sphere import OF_DIRECTION
 from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.refinement import considered, posterior_of
+from triaxcal.evidence.search import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.progress import Progress, Stage, untold
 from triaxcal.rounding import reaches

@@ -29,11 +29,10 @@ from triaxcal.interchange import tables
 from triaxcal.interchange.calibration_document import Document, calibration_document
 from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, uncertainty_over_error
 from triaxcal.interchange.earlier_calibration import earlier_in
-from triaxcal.poses.covariates import covariates_elsewhere
+from triaxcal.poses.covariates import InStream, covariates_elsewhere, followed
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.stream_covariates import InStream, followed
 from triaxcal.uncertainty import Stated
-from triaxcal.uncertainty.readings import uncertainty_of_magnitude, uncertainty_of_readings
+from triaxcal.uncertainty.propagation import uncertainty_of_magnitude, uncertainty_of_readings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

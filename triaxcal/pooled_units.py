@@ -15,7 +15,7 @@ from enum import StrEnum
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import InvalidData
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.shape_posterior import Shape, shapes_of
+from triaxcal.evidence.posterior import Shape, shapes_of
 
 
 class Answer(StrEnum):

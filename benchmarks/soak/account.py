@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import bundle_of
-from triaxcald.pipeline import DecodedStream
 from triaxcald.recording import schema
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.raw_batch import decode_raw

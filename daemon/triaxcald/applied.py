@@ -13,11 +13,11 @@ import numpy as np
 from triaxcal.documents import OUT, UNCERTAINTY, Calibration
 from triaxcal.errors import MissingChannel
 from triaxcal.number_format import number_of
-from triaxcal.poses.stream_covariates import InStream
+from triaxcal.poses.covariates import InStream
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
+from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
-from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.export import Rows
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.series import is_recording, open_recording

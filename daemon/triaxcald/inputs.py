@@ -17,11 +17,11 @@ from triaxcal.effects import TEMPERATURE
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.number_format import number_of
 from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.detector import Windows
+from triaxcal.poses.stillness.windows import Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
 from triaxcal_drivers.file_kind import special_kind
@@ -30,8 +30,9 @@ from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald import text
+from triaxcald.decoded import DecodedStream
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import DecodedStream, Pipeline, of_poses, together
+from triaxcald.pipeline import Pipeline, of_poses, together
 from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents

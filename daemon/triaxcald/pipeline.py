@@ -15,7 +15,7 @@ from triaxcal.number_format import number_of
 from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose, StillSpan
 from triaxcal.poses.quality import Finding, disturbances
-from triaxcal.poses.stillness.detector import Windows
+from triaxcal.poses.stillness.windows import Windows
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite

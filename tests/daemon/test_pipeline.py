@@ -15,7 +15,8 @@ from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
-from triaxcald.pipeline import DecodedStream, Pipeline, beside_samples, only_finite, together
+from triaxcald.decoded import DecodedStream, beside_samples, only_finite
+from triaxcald.pipeline import Pipeline, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from triaxcal.interchange.calibration_document import assumed_in
-from triaxcal.uncertainty.budget_statements import ThermometerAt, UnmodelledTemperature
+from triaxcal.uncertainty.statements import ThermometerAt, UnmodelledTemperature
 from triaxcald.remarks import assumption, none_could_show
 
 

@@ -13,7 +13,8 @@ from triaxcal.effects import effect_named
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 from triaxcal.synthetic import noisy_poses
 
 POSE_NOISE_G = 2e-5

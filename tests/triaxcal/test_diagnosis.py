@@ -14,8 +14,8 @@ from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.recordings import together
 from triaxcal.evidence import Refusal, posterior_of
-from triaxcal.evidence.identifiability import Why
-from triaxcal.model.moment import Moment
+from triaxcal.evidence.findings import Why
+from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
 
 Poses = Callable[..., list[Pose]]

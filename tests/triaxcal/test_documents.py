@@ -22,7 +22,7 @@ from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, Residual
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.pictures import residuals_figure
 from triaxcal.synthetic import noisy_poses

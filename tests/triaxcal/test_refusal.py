@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from triaxcal.errors import Refused
-from triaxcal.estimate.caution import FewPoses, PoorSpread
+from triaxcal.estimate.calibration import FewPoses, PoorSpread
 from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import cube_directions, dilution

@@ -3,20 +3,21 @@ once an effect explains it.
 
 The mean of the outputs over a pose goes with the mean of the time and of the
 channels over it, so an effect that follows them is not disturbed by their
-moving inside the pose; a model that lacks the effect is.
-"""
+moving inside the pose; a model that lacks the effect is."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.effects.contract import DURATION, SINCE_START, TIME, channel_of, is_derived, lag_in
+from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import f_sf
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, linearise_all, residual_chi2
 from triaxcal.poses.covariates import covariates_elsewhere, rate_of_lag
 from triaxcal.poses.pose import Pose
 
@@ -101,3 +102,148 @@ def _change(poses: Sequence[Pose], model: Calibration, covariates: Mapping[str, 
 def _with(pose: Pose, creep: Floats) -> Pose:
     change = (np.outer(creep, creep) - np.outer(pose.creep, pose.creep)) / 12
     return replace(pose, covariance=pose.covariance + change, creep=creep)
+
+
+# How |a| goes inside the poses: data of its own beside the means.
+
+PLACES = np.linspace(-0.5, 0.5, 6)
+"""Where in a pose the model is asked, from its beginning to its end: enough to
+follow a step or a steep decay."""
+
+
+@dataclass(frozen=True)
+class PoseSlopes:
+    """``inside`` are the poses at all `PLACES`, one place after the other,
+    ``middle`` as they are in the middle, both with the covariance of the
+    slopes; ``errors`` (n,) by covariate those of the changes that the
+    covariates are said to have gone through, and ``moving`` the covariates that
+    go through any."""
+
+    inside: Problem
+    middle: Problem
+    errors: Mapping[str, Floats]
+    moving: frozenset[str]
+    widening: Floats | float = 1.0
+    """Times the errors that the noise makes, (n,) or all."""
+
+    @classmethod
+    def of(cls, problem: Problem, poses: Sequence[Pose]) -> PoseSlopes | None:
+        """None where the poses do not know theirs."""
+        error = np.array([p.slope_error for p in poses])
+        if not np.isfinite(error).all() or not np.isfinite([p.slope for p in poses]).all():
+            return None
+        length = np.array([p.end_s - p.start_s for p in poses])
+        change, errors = _changes(problem, poses, length)
+        moving = frozenset(change)
+        change |= {n: np.zeros(len(poses)) for n in problem.channels.keys() - change.keys()}
+        middle = replace(problem, excess=0.0, covariance=error[:, None, None] ** 2 * np.eye(3))
+        inside = replace(
+            middle,
+            u=_moved(problem.u, np.array([p.slope for p in poses])),
+            covariance=np.concatenate([middle.covariance] * len(PLACES)),
+            # A moment is asked for, not a mean over the pose.
+            channels={n: _moved(v, change[n]) for n, v in problem.channels.items()}
+            | {DURATION: np.zeros(len(PLACES) * len(poses))},
+        )
+        return cls(inside, middle, errors, moving)
+
+    def linearise(self, state: State, jacobian: bool = True) -> Linearised:
+        """By how much |a| goes along each pose where it should stay, as
+        `triaxcal.estimate.likelihood.linearise` has it."""
+        everywhere, by_theta, _ = linearise(self.inside, state, jacobian)
+        r = self.along(everywhere)
+        if not jacobian:
+            return r, by_theta, np.empty(0)
+        J = self.along(by_theta)
+        here, _, error = linearise(self.middle, state)
+        variance = error**2
+        # In one order whatever the process, or audits would differ in the last
+        # digits.
+        for name in sorted({c for e in state.effects for c in e.needs} & self.errors.keys()):
+            channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
+            there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
+            variance = variance + (there - here) ** 2
+        return r, J, self.widening * np.sqrt(variance)
+
+    def along(self, values: Floats) -> Floats:
+        """(n,…) by how much ``values`` (k·n,…) at all `PLACES` go up along each
+        pose."""
+        slope = PLACES / (PLACES @ PLACES)
+        return np.tensordot(slope, values.reshape(len(slope), -1, *values.shape[1:]), 1)
+
+    def asked_at(self, inside: Problem) -> PoseSlopes:
+        return replace(self, inside=inside)
+
+    def widened(self, factor: Floats) -> PoseSlopes:
+        return replace(self, widening=self.widening * factor)
+
+    def only(self, rows: Ints | slice) -> PoseSlopes:
+        """Those of some of the poses."""
+        n = len(self.middle.u)
+        kept = np.arange(n)[rows]
+        inside = self.inside.only(np.concatenate([kept + n * k for k in range(len(PLACES))]))
+        errors = {name: error[rows] for name, error in self.errors.items()}
+        widening: Floats = np.broadcast_to(self.widening, n)[rows]
+        return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, widening=widening)
+
+    def inform(self, effects: Sequence[Effect]) -> bool:
+        """Whether any of the effects goes with something that moves inside the
+        poses."""
+        return any(n in self.moving for e in effects for n in e.needs)
+
+
+def with_slopes(problem: Problem, poses: Sequence[Pose], effects: Sequence[Effect]) -> Problem | None:
+    """The problem with the slopes beside the means; None where they tell
+    nothing of the effects."""
+    slopes = PoseSlopes.of(problem, poses) if effects else None
+    return replace(problem, slopes=slopes) if slopes is not None and slopes.inform(effects) else None
+
+
+def slopes_p(problem: Problem, state: State, pure: float) -> float:
+    """Probability of slopes as far as these from those that the model predicts,
+    by the noise inside the poses, of which ``pure`` degrees of freedom are
+    known; ``state`` is that of a fit to everything."""
+    left = len(problem.u) - max(len(state.theta) - len(problem.u), 0)
+    if left <= 0:
+        return 0.0
+    return float(f_sf(left_by_slopes(problem, state) / left, left, max(pure, 1.0)))
+
+
+def left_by_slopes(problem: Problem, state: State) -> float:
+    """By how much the sum of squares of a fit to everything is larger than that
+    of a fit to the means alone."""
+    r, _, s = linearise_all(problem, state)
+    apart = float(np.sum((r / s) ** 2)) - residual_chi2(linearise(problem, state))
+    return max(apart, 0.0) if np.isfinite(apart) else np.inf
+
+
+def _moved(values: Floats, change: Floats) -> Floats:
+    """(k·n,…) at all `PLACES` of what is ``values`` (n,…) in the middle."""
+    return np.concatenate([values + x * change for x in PLACES])
+
+
+def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """By covariate, (n,) each: by how much it changes along each pose, and the
+    standard error of that."""
+    change = dict.fromkeys((TIME, SINCE_START), length)
+    errors: dict[str, Floats] = {}
+    for name in problem.channels:
+        channel = channel_of(name)
+        if is_derived(name) or any(channel not in p.bends for p in poses):
+            continue
+        known = [(p.rates[channel], p.rate_errors[channel], p.bends[channel], p.bend_errors[channel]) for p in poses]
+        if not np.isfinite(known).all():
+            continue
+        change[name] = length * np.array([p.rates[channel] for p in poses])
+        errors[name] = length * np.array([p.rate_errors[channel] for p in poses])
+        change[rate_of(name)] = length * np.array([p.bends[channel] for p in poses])
+        errors[rate_of(name)] = length * np.array([p.bend_errors[channel] for p in poses])
+    for name in problem.channels:
+        lag = lag_in(name)
+        if lag is not None and lag[0] in change:
+            channel = channel_of(lag[0])
+            rate = np.array([p.rates[channel] for p in poses])
+            change[name] = length * rate_of_lag(problem.channels[name], rate, lag[1])
+            # That of the rate counts with the channel itself.
+            errors[name] = length / lag[1] * np.array([p.channel_errors.get(channel, 0.0) for p in poses])
+    return {n: c for n, c in change.items() if n in problem.channels}, errors

@@ -3,25 +3,28 @@ its poses, and how far both may be trusted."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Bools, Floats, Ints, rms
+from triaxcal.effects.contract import DURATION, SINCE_START, Effect, reshaped
 from triaxcal.errors import NotStill
-from triaxcal.estimate.calibration import Calibration, Residual, pose_results, studentized
-from triaxcal.estimate.caution import (
+from triaxcal.estimate.calibration import (
     BirgeRatio,
+    Calibration,
     Caution,
     ExcessVariance,
     FewPoses,
     HighLeverage,
     PoorSpread,
+    Residual,
     ResidualsTooSmall,
+    pose_results,
+    studentized,
 )
-from triaxcal.estimate.cross_validation import cross_validated
-from triaxcal.estimate.excess import Excess
 from triaxcal.estimate.initial_estimate import DILUTION_LIMIT
 from triaxcal.estimate.likelihood import (
     Linearised,
@@ -34,11 +37,247 @@ from triaxcal.estimate.likelihood import (
     residual_chi2,
     solve,
 )
-from triaxcal.estimate.nonlinear_parameter_errors import shape_errors
 from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, lack_of_fit_p, raised_dof, within_pose_dof
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import probability
+
+# Standard errors of what the fit holds fixed: the shapes of effects
+# (`Effect.shape`), which the search has chosen.
+
+UNLIKELY = 16.0
+"""Chi-square over its minimum beyond which a value, and what is next to it,
+needs no closer look."""
+STRAIGHT = 1.0
+"""The likelihood is looked at so closely that chi-square changes by no more
+from one value to the next."""
+HALVED_MOST = 8
+"""Halvings of an interval, to 1/256: a likelihood that is steeper still is an
+edge."""
+PARTS = 20
+"""Parts of an interval in the sum that stands for an integral: chi-square
+changes by about `STRAIGHT` over it, so that the weight changes little over a
+part."""
+NOTHING_LIKE = 1e300
+"""In place of infinity, between which and the next nothing could be
+interpolated."""
+
+
+def shape_errors(
+    problem: Problem, state: State, columns: Floats, thousandths: Floats, birge_ratio: float
+) -> dict[str, float]:
+    """By "effect.name"; none of a shape that moves nothing at all.
+
+    ``columns`` (n,m) are the derivatives of the residuals by the shapes,
+    ``thousandths`` (m,) the standard errors by these, in thousandths of the
+    shapes' values, raised by the ``birge_ratio`` already.
+    """
+    out = {}
+    named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
+    for (i, name, value), column, thousandth in zip(named, columns.T, thousandths, strict=True):
+        error = _by_likelihood(problem, state, i, name, birge_ratio) if has_edges(state.effects[i]) else None
+        if error is None and np.any(column):
+            error = 1e-3 * abs(value) * float(thousandth)
+        if error is not None:
+            out[f"{state.effects[i].name}.{name}"] = error
+    return out
+
+
+def has_edges(effect: Effect) -> bool:
+    """Whether it changes at the edges of poses, as a step does: the likelihood
+    of its shape has kinks there, and is flat between two poses, so that its
+    curvature tells nothing."""
+    return DURATION in effect.needs
+
+
+def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[float], edges: Floats) -> float | None:
+    """The rms distance from a shape's ``value`` to what it may be, each
+    weighted by its likelihood, from the lowest to the highest of those
+    ``tried``; ``edges`` are those of the poses. None where only one was tried.
+
+    Of a step between two poses that is the rectangular distribution over the
+    time between them (JCGM 100, 4.3.7), with shoulders where it may have been
+    inside a pose, and other gaps where the directions of the poses hide it.
+    """
+    profile = _Profile(chi2_at)
+    profile.look_at(np.unique([value, *tried]))
+    if len(profile.x) < 2:
+        return None
+    profile.look_at(profile.where_likely(edges))
+    profile.look_closer()
+    return profile.spread_about(value)
+
+
+def edges_of(problem: Problem) -> Floats:
+    """When poses begin and end, in seconds since the start."""
+    middle, half = problem.covariates[SINCE_START], problem.covariates[DURATION] / 2
+    return np.concatenate([middle - half, middle + half])
+
+
+def _by_likelihood(problem: Problem, state: State, i: int, name: str, birge_ratio: float) -> float | None:
+    effect = state.effects[i]
+    tried = [v.shape[name][0] for v in effect.variants(problem.covariates) if name in v.shape]
+
+    def chi2_at(value: float) -> float:
+        return _left(problem, state, i, name, value) / birge_ratio**2
+
+    return spread(effect.shape[name][0], chi2_at, tried, edges_of(problem))
+
+
+class _Profile:
+    """Chi-square (m,) at ascending values ``x`` (m,) of a shape."""
+
+    def __init__(self, chi2_at: Callable[[float], float]) -> None:
+        self._chi2_at = chi2_at
+        self.x, self.chi2 = np.empty(0), np.empty(0)
+
+    def look_at(self, more: Floats) -> None:
+        rows = np.searchsorted(self.x, more)
+        self.chi2 = np.insert(self.chi2, rows, [min(self._chi2_at(float(v)), NOTHING_LIKE) for v in more])
+        self.x = np.insert(self.x, rows, more)
+
+    @property
+    def _likely(self) -> Bools:
+        """(m−1,) the intervals of which one end is."""
+        return np.asarray(np.minimum(self.chi2[:-1], self.chi2[1:]) < self.chi2.min() + UNLIKELY)
+
+    def where_likely(self, more: Floats) -> Floats:
+        """Of further values those in intervals that are likely."""
+        more = np.setdiff1d(more, self.x)
+        more = more[(self.x[0] < more) & (more < self.x[-1])]
+        return np.asarray(more[self._likely[np.searchsorted(self.x, more) - 1]])
+
+    def look_closer(self) -> None:
+        """Halves the likely intervals along which chi-square changes."""
+        for _ in range(HALVED_MOST):
+            coarse = self._likely & (np.abs(np.diff(self.chi2)) > STRAIGHT)
+            if not coarse.any():
+                return
+            self.look_at((self.x[:-1] + self.x[1:])[coarse] / 2)
+
+    def spread_about(self, value: float) -> float:
+        """The rms distance from a value, each weighted by its likelihood, of
+        which the logarithm is straight between two."""
+        wide = np.diff(self.x)
+        at = (self.x[:-1, None] + wide[:, None] * (np.arange(PARTS) + 0.5) / PARTS).ravel()
+        weight = np.repeat(wide, PARTS) * np.exp((self.chi2.min() - np.interp(at, self.x, self.chi2)) / 2)
+        return float(np.sqrt(np.sum(weight * (at - value) ** 2) / np.sum(weight)))
+
+
+def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
+    """Chi-square with another value of a shape, everything else fitted again,
+    in linear reckoning."""
+    other = reshaped(state.effects[i], name, value)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return residual_chi2(
+            linearise_all(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :])))
+        )
+
+
+# How well a fit predicts the poses that it did not see.
+
+STRAIGHT_STEP = 1e-4
+"""Steps of the scaled parameters up to which the fit is straight, to about this
+share of the step."""
+
+
+def cross_validated(problem: Problem, state: State) -> float | None:
+    """rms of each pose's |a| − reference under a fit to all the others; None
+    where a pose alone carries a parameter.
+
+    ``state`` is at the minimum. What leaving a pose out moves is exact for a
+    linear problem; where that is so far that the curvature could show, the rest
+    is fitted again from there.
+    """
+    r, J, s = linearise_all(problem, state)
+    n = len(problem.u)
+    if len(r) <= len(state.theta):
+        return None
+    norms = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
+    weighted = J / s[:, None] / norms
+    gain = np.linalg.pinv(weighted, rcond=1e-14)
+    # By pose (n,k): its mean, and what else it tells, which is excluded with
+    # it.
+    of_pose = np.arange(len(r)).reshape(-1, n).T
+    hat = np.einsum("nkp,pnl->nkl", weighted[of_pose], gain[:, of_pose])
+    free = np.eye(of_pose.shape[1]) - hat
+    if np.linalg.eigvalsh(free).min() < 1e-6:
+        return None
+    misses = np.linalg.solve(free, (r / s)[of_pose][..., None])[..., 0]
+    moved = np.einsum("pnk,nk->np", gain[:, of_pose] / norms[:, None, None], misses)
+    misses = misses[:, 0] * s[:n]
+    for i in np.flatnonzero(np.abs(moved).max(axis=1) > STRAIGHT_STEP):
+        rest: Ints = np.delete(np.arange(n), i)
+        without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=2)
+        misses[i] = linearise(problem.only(slice(i, i + 1)), without, jacobian=False)[0][0]
+    return rms(misses)
+
+
+# What residuals show beyond the noise inside the poses, and what it makes of the
+# errors.
+
+NO_CHANCE = 1e-4
+"""Lack-of-fit p below which an excess variance is added, which changes the
+weights. Above it, a Birge ratio multiplies all errors. It is small because
+other weights cost a hundredfold in variance where poses differ much in noise
+and no excess was there."""
+EXACT = 1e-10
+"""To which share the excess is sought."""
+
+
+@dataclass(frozen=True)
+class Excess:
+    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard
+    deviation of |a|, in units of the reference vector, that all poses have
+    beside their noise."""
+
+    birge_ratio: float = 1.0
+    excess_g: float = 0.0
+
+    @classmethod
+    def estimated(cls, linearised: Linearised, n: int, residual_dof: int, pure_dof: float) -> Excess:
+        """That with which the sum of squares that a fit leaves is its
+        ``residual_dof``, in linear reckoning from residuals, derivatives and
+        errors near its minimum, of which the first ``n`` are the means of the
+        poses. ``pure_dof`` are the degrees of freedom of the noise inside the
+        poses.
+
+        The excess is that of Mandel and Paule (1970, Anal. Chem. 42:1194), here
+        for a fit of several parameters; the factor that of Birge (1932, Phys.
+        Rev. 40:207), at least 1 unless no pose knows its noise. Raises Refused
+        where the fit ran away.
+        """
+        r, J, s = linearised
+
+        def ratio(excess: float) -> float:
+            error = s * np.tile(_widened(s[:n], excess), len(s) // n)
+            return residual_chi2((r, J, error)) / residual_dof
+
+        whole = ratio(0.0) if residual_dof > 0 else 1.0
+        if not np.isfinite(whole):
+            raise NotStill("the fit ran away")
+        p = probability(lack_of_fit_p(whole * residual_dof, residual_dof, pure_dof))
+        if p is None or p >= NO_CHANCE:
+            return cls(float(np.sqrt(whole if pure_dof < 1 else max(whole, 1.0))))
+        high = float(np.linalg.norm(r[:n])) / np.sqrt(residual_dof) + float(np.max(s[:n]))
+        while ratio(high) > 1:
+            high *= 2
+        return cls(excess_g=float(scipy.optimize.brentq(lambda e: ratio(e) - 1, 0.0, high, xtol=EXACT * high)))
+
+    def added_to(self, problem: Problem, state: State) -> Problem:
+        """The problem with the excess; ``state`` is near its minimum. What else
+        a pose tells is widened as its mean is: what acts between poses may act
+        inside them as well."""
+        if not self.excess_g:
+            return problem
+        slopes = problem.slopes and problem.slopes.widened(_widened(linearise(problem, state)[2], self.excess_g))
+        return replace(problem, excess=self.excess_g, slopes=slopes)
+
+
+def _widened(error: Floats, excess: float) -> Floats:
+    """(n,) by what an excess widens errors (n,)."""
+    return np.asarray(np.hypot(1.0, excess / error))
+
 
 DILUTION_WARNING = 10.0
 """A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold,

@@ -5,14 +5,13 @@ effects, outliers and what has no name.
 against what went before.
 """
 
-from triaxcal.evidence.candidate_actions import Action, ActionKind
 from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained, findings
-from triaxcal.evidence.information_gain import Advice, Expected, advice
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal
+from triaxcal.evidence.next_measurement import Action, ActionKind, Advice, Expected, advice
 from triaxcal.evidence.pooled import Pooled, pool
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.refinement import posterior_of
+from triaxcal.evidence.search import posterior_of
 
 __all__ = [
     "Action",

@@ -9,18 +9,15 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.empirical import Empirical
-from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
-from triaxcal.estimate.caution import BirgeRatio, ExcessVariance, ResidualsTooSmall
+from triaxcal.estimate.calibration import BirgeRatio, Calibration, ExcessVariance, HoldsAt, Residual, ResidualsTooSmall
 from triaxcal.estimate.fit_assessment import too_small
 from triaxcal.estimate.likelihood import State, linearise
 from triaxcal.evidence.linearised_data import LinearisedData
-from triaxcal.evidence.mixture_components import components
+from triaxcal.evidence.mixture import components
 from triaxcal.evidence.model_average import Average, Refusal, least_loss
-from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.shape_posterior import shapes_of
+from triaxcal.evidence.posterior import Posterior, shapes_of
 from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
-from triaxcal.uncertainty.extrapolation import extrapolated
-from triaxcal.uncertainty.propagation import gain_given_prior
+from triaxcal.uncertainty.propagation import extrapolated, gain_given_prior
 
 
 def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> tuple[Calibration, Refusal | None]:

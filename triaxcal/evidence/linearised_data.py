@@ -13,14 +13,13 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.creep import without_creep
+from triaxcal.estimate.creep import PoseSlopes, without_creep
 from triaxcal.estimate.initial_estimate import started_problem
 from triaxcal.estimate.likelihood import Problem, State, linearise_all
-from triaxcal.estimate.pose_slopes import PoseSlopes
 from triaxcal.model.sensor import LINEAR, Radius
 from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.degrees_of_freedom import noise_levels
-from triaxcal.poses.mean_variance_mixture import NoiseLevels
+from triaxcal.poses.noise_spectrum import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 QUIETEST = 0.1

@@ -16,9 +16,8 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import SMOOTH, Empirical
 from triaxcal.estimate.calibration import HoldsAt
-from triaxcal.evidence.mixture_components import Components
+from triaxcal.evidence.mixture import Components, NextReadings
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.reported_parameters import NextReadings
 from triaxcal.evidence.terms import Term
 from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledCovariance, UnmodelledKind
 from triaxcal.model.directions import spiral

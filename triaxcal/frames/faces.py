@@ -15,7 +15,7 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.caution import Caution
+from triaxcal.estimate.calibration import Caution
 
 LABELS = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
 NEAR_RAD = 0.05

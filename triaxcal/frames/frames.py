@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from triaxcal.arrays import Floats
 from triaxcal.distributions import chi2_sf, t_ppf
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.caution import Caution
+from triaxcal.estimate.calibration import Caution
 from triaxcal.frames.faces import LABELS, axis_of, nearest_rotation, opposite
 from triaxcal.frames.fixture import Fixture, fixture_of
 from triaxcal.frames.orientations import LARGE_RAD

@@ -19,10 +19,19 @@ import scipy
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import chi2_sf
-from triaxcal.estimate.caution import Caution
+from triaxcal.estimate.calibration import Caution
 from triaxcal.frames.faces import Labelling, axis_of
-from triaxcal.frames.orientations import FLOOR_RAD, LARGE_RAD, SHOWS, Assumed, Face, felt, tilt_of_others, turned
-from triaxcal.frames.verticals import Verticals
+from triaxcal.frames.orientations import (
+    FLOOR_RAD,
+    LARGE_RAD,
+    SHOWS,
+    Assumed,
+    Face,
+    Verticals,
+    felt,
+    tilt_of_others,
+    turned,
+)
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
 
 ROUNDS = 6

@@ -6,52 +6,407 @@ attitude gives, ``P = K R C`` (3,3) and ``c = K b``: twelve parameters, the nine
 of the sensor and the rotation C from the table's frame to the sensor's, which
 magnitudes cannot show. Attitudes err too. Their error is a nuisance of two
 angles a pose with a variance of its own: where it is large against the noise
-the magnitude still counts in full, and the fit tends to that of the ellipsoid.
-"""
+the magnitude still counts in full, and the fit tends to that of the ellipsoid."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
+import scipy.linalg
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import (
+    BirgeRatio,
     Calibration,
+    Caution,
     Exclusion,
+    FewPoses,
     HoldsAt,
     PoseResult,
     Residual,
     pose_results,
     studentized,
 )
-from triaxcal.estimate.caution import BirgeRatio, Caution, FewPoses
-from triaxcal.inputs.attitude_cautions import (
-    AttitudeExcluded,
-    AttitudesContradict,
-    AttitudesTied,
-    DeclaredErrorContradicted,
-    MagnitudeContradicts,
-    Row,
-)
-from triaxcal.inputs.turntable import (
-    ERROR_MOST,
-    TurntableData,
-    TurntableSolution,
-    iterated,
-    solved,
-    wrong_by_magnitude,
-    wrong_by_residual,
-)
-from triaxcal.inputs.turntable_parameters import parameters_by_entries, second_order, sensor_and_rotation, signs_of
+from triaxcal.estimate.initial_estimate import problem_of, start
+from triaxcal.frames.faces import nearest_rotation
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, within_pose_dof
-from triaxcal.poses.pose import Pose
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, lack_of_fit_p, within_pose_dof
+from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.poses.pose_in_words import the_poses
+
+# What speaks against a fit to poses of known attitude.
+
+
+@dataclass(frozen=True)
+class Row:
+    """One of the attitudes that were given, by its name, and when its pose
+    began."""
+
+    name: str
+    began: PoseStart
+
+
+@dataclass(frozen=True)
+class AttitudesTied(Caution):
+    """One of these attitudes is wrong; none is excluded."""
+
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class AttitudeExcluded(Caution):
+    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the
+    table's frame."""
+
+    row: Row
+    off_rad: float
+    up: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class AttitudesContradict(Caution):
+    """Each other, by more than noise; ``error_rad`` by axis is estimated from
+    that."""
+
+    error_rad: float
+
+
+@dataclass(frozen=True)
+class DeclaredErrorContradicted(Caution):
+    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``;
+    ``declared_rad`` stays in force.
+
+    With it the standard errors are up to ``raised`` times what they are with
+    the estimate.
+    """
+
+    declared_rad: float
+    error_rad: float
+    uncertainty_rad: float
+    raised: float
+
+
+@dataclass(frozen=True)
+class MagnitudeContradicts(Caution):
+    """Under the fit |a| is off by ``ratio`` times its noise, most in the
+    ``worst`` row."""
+
+    ratio: float
+    worst: Row
+
+
+# Weighted least squares of ``u = P g + c`` over poses of known attitude, whose
+# errors are nuisances of the fit.
+
+PARAMETERS = 12
+"""A matrix of nine and three offsets: the attitudes tell the rotation as well."""
+ROUNDS_MOST = 60
+"""Steps of Gauss–Newton, which ends sooner where it converges."""
+CONVERGED = 1e-11
+"""Relative change of the matrix from step to step: far below any noise, above
+rounding."""
+ALARM = 0.005
+"""Probability that one of a set of right rows is called wrong."""
+ESTIMATE_BELOW = 0.2
+"""Residuals of less probability are put down to the attitudes, where nobody
+declared their error."""
+ERROR_LEAST = 1e-8
+"""Attitudes that are off by less, in rad (2 milliarcseconds), count as exact."""
+ERROR_MOST = 0.3
+"""Attitudes that are off by more, in rad, carry nothing."""
+PAIRS_MOST = 400
+"""Pairs of rows of which each is tried for the rotation: one of two right rows
+is enough. All pairs of 28 rows; of more rows some, always the same, for the
+sake of time."""
+TIED = 0.02
+"""Rows that take out of the sum of squares within this share of each other
+cannot be distinguished."""
+
+
+class AttitudesContradictReadings(Refused):
+    """In too many rows to tell which are right."""
+
+    def __init__(self) -> None:
+        super().__init__("attitudes and readings contradict each other; are the rows in the order of the poses?")
+
+
+@dataclass(frozen=True)
+class TurntableData:
+    """``u`` (n,3) outputs, ``covariance`` (n,3,3) of them with ``dof`` behind,
+    ``ups`` (n,3) as stated."""
+
+    u: Floats
+    covariance: Floats
+    ups: Floats
+    reference: float
+    dof: float
+
+    def only(self, rows: Ints) -> TurntableData:
+        return replace(self, u=self.u[rows], covariance=self.covariance[rows], ups=self.ups[rows])
+
+
+@dataclass(frozen=True)
+class TurntableSolution:
+    """``P`` (3,3) and ``c`` (3,) with ``covariance`` (12,12) of P row by row
+    and c; ``noise_only`` the same were the attitudes exact. ``rest`` (n,3)
+    residuals, ``weight`` (n,3,3) their inverse covariance, ``design`` (n,3,12).
+    ``found`` (n,3) the attitudes that the fit settled on, unit vectors;
+    ``target`` (n,3) what ``design @ p`` is fitted to.
+    """
+
+    data: TurntableData
+    P: Floats
+    c: Floats
+    covariance: Floats
+    noise_only: Floats
+    rest: Floats
+    weight: Floats
+    design: Floats
+    found: Floats
+    target: Floats
+    error_rad: float
+    estimated: bool
+
+    @property
+    def chi2(self) -> float:
+        return float(np.einsum("ni,nij,nj->", self.rest, self.weight, self.rest))
+
+    @property
+    def left(self) -> int:
+        return 3 * len(self.data.u) - PARAMETERS
+
+    @property
+    def p(self) -> float | None:
+        return lack_of_fit_p(self.chi2, self.left, self.data.dof)
+
+    def without(self, row: int) -> tuple[Floats, Floats]:
+        """P and c of all other poses."""
+        rest: Ints = np.delete(np.arange(len(self.rest)), row)
+        p, _ = _weighted(self.design[rest], self.weight[rest], self.target[rest])
+        return p[:9].reshape(3, 3), p[9:]
+
+    @property
+    def error_uncertainty_rad(self) -> float:
+        """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is
+        ``left``.
+
+        The sum has variance 2 ``left``, and the part of it that is the
+        attitudes' falls with the square of their error.
+        """
+        of_noise = np.einsum("nij,njk,nkl,nli->", self.weight, self.free, self.weight, self.data.covariance)
+        of_attitudes = float(self.left - of_noise)
+        if not of_attitudes > 0:
+            return float("inf")
+        return self.error_rad * float(np.sqrt(2 * self.left)) / (2 * of_attitudes)
+
+    @property
+    def free(self) -> Floats:
+        """(n,3,3): covariance of each pose's residual."""
+        fitted = np.einsum("nip,pq,njq->nij", self.design, self.covariance, self.design)
+        return np.asarray(np.linalg.inv(self.weight) - fitted)
+
+
+def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
+    """With the declared error of the attitudes; else the smallest with which
+    the residuals are as large as expected."""
+    solution = iterated(data, error_rad or 0.0)
+    if error_rad is not None or solution.p is None or solution.p > ESTIMATE_BELOW:
+        return solution
+
+    def excess(log: float) -> float:
+        tried = iterated(data, float(np.exp(log)))
+        return tried.chi2 - tried.left
+
+    low = np.log(ERROR_LEAST)
+    if excess(low) <= 0:
+        return solution
+    high = low + 2
+    while excess(high) > 0:
+        low, high = high, high + 2
+        if low > np.log(ERROR_MOST):
+            raise AttitudesContradictReadings
+    best = float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-2)))
+    return replace(iterated(data, best), estimated=True)
+
+
+def iterated(data: TurntableData, error_rad: float) -> TurntableSolution:
+    """With attitudes that err by so much: Gauss–Newton over the twelve
+    parameters, each attitude following within its error. Raises Refused where
+    it runs away."""
+    n = len(data.u)
+    g = data.ups
+    design = np.zeros((n, 3, PARAMETERS))
+    P, c = _plain(data)
+    for _ in range(ROUNDS_MOST):
+        for i in range(3):
+            design[:, i, 3 * i : 3 * i + 3] = data.reference * g
+            design[:, i, 9 + i] = 1.0
+        across = _across(g)
+        turned = data.reference * P @ across  # (n,3,2): outputs by the two angles
+        stated = np.einsum("nik,ni->nk", across, data.ups - g)  # the stated attitude, seen from the settled one
+        V = data.covariance + error_rad**2 * turned @ turned.transpose(0, 2, 1)
+        try:
+            weight = np.linalg.inv(V)
+        except np.linalg.LinAlgError:
+            raise AttitudesContradictReadings from None
+        target = data.u - np.einsum("nik,nk->ni", turned, stated)
+        p, covariance = _weighted(design, weight, target)
+        P, before, c = p[:9].reshape(3, 3), P, p[9:]
+        rest = target - design @ p
+        if error_rad:
+            tilt = stated + error_rad**2 * np.einsum("nik,nij,nj->nk", turned, weight, rest)
+            g = g + np.einsum("nik,nk->ni", across, tilt)
+            g /= np.linalg.norm(g, axis=1, keepdims=True)
+        if np.max(np.abs(P - before)) < CONVERGED * np.max(np.abs(P)):
+            break
+    _, noise_only = _weighted(design, np.linalg.inv(data.covariance), target)
+    return TurntableSolution(data, P, c, covariance, noise_only, rest, weight, design, g, target, error_rad, False)
+
+
+def _plain(data: TurntableData) -> tuple[Floats, Floats]:
+    """P and c without weights, to begin with."""
+    design = np.concatenate([data.reference * data.ups, np.ones((len(data.u), 1))], axis=1)
+    found = np.linalg.lstsq(design, data.u, rcond=None)[0]
+    return found[:3].T, found[3]
+
+
+def _weighted(design: Floats, weight: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Least squares with weights by pose: parameters (12,) and covariance
+    (12,12)."""
+    root = np.linalg.cholesky(weight).transpose(0, 2, 1)
+    X, y = (root @ design).reshape(-1, PARAMETERS), (root @ target[..., None]).ravel()
+    norms = np.linalg.norm(X, axis=0)
+    inverse = np.linalg.inv((X / norms).T @ (X / norms)) / np.outer(norms, norms)
+    return inverse @ (X.T @ y), inverse
+
+
+def _across(g: Floats) -> Floats:
+    """(n,3,2): two unit vectors at right angles to each of ``g`` (n,3)."""
+    spare = np.eye(3)[np.argmin(np.abs(g), axis=1)]
+    one = np.cross(g, spare)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return np.stack([one, np.cross(g, one)], axis=2)
+
+
+def wrong_by_magnitude(poses: Sequence[Pose], ups: Floats, reference: float) -> Ints:
+    """Rows whose attitude does not go with those of most others, judged by the
+    angles that |a| alone says are between the poses. None where |a| cannot
+    say."""
+    try:
+        problem = problem_of(poses, reference=reference)
+        sensor = start(problem, poses, (1, 1, 1)).sensor(problem)
+    except Refused:
+        return np.zeros(0, dtype=int)
+    a = sensor.specific_force(np.array([p.mean for p in poses]), {})
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    mirrored = a * [1.0, 1.0, -1.0]  # signs are not known, but only their product is no rotation
+    off = min((_off_most(v, ups) for v in (a, mirrored)), key=lambda v: float(np.median(v)))
+    scale = max(float(np.median(off)), 1e-9)
+    return np.flatnonzero(off > np.clip(10 * scale, 0.02, ERROR_MOST))
+
+
+def _off_most(a: Floats, ups: Floats) -> Floats:
+    """(n,) angles between ``ups`` and ``a`` under the rotation that suits most
+    of them best."""
+    i, j = np.tril_indices(len(a), -1)
+    apart = np.minimum(*(np.linalg.norm(np.cross(v[i], v[j]), axis=1) for v in (a, ups))) > 0.3
+    i, j = i[apart], j[apart]
+    if len(i) > PAIRS_MOST:
+        some = np.random.default_rng(0).permutation(len(i))[:PAIRS_MOST]
+        i, j = i[some], j[some]
+    C = nearest_rotation(np.stack([ups[i], ups[j]], axis=1), np.stack([a[i], a[j]], axis=1))
+    off: Floats = np.linalg.norm(a - np.einsum("mij,nj->mni", C, ups), axis=2)
+    return off[int(np.argmin(np.median(off, axis=1)))] if len(off) else np.full(len(a), np.inf)
+
+
+def wrong_by_residual(s: TurntableSolution) -> Ints:
+    """The row whose residual stands out from the noise and from all others, as
+    if it had not been in the fit.
+
+    None where no row does, several where these cannot be distinguished.
+    """
+    n, left = len(s.data.u), s.left - 3
+    if left < 3:
+        return np.zeros(0, dtype=int)
+    taken = np.einsum("ni,nij,nj->n", s.rest, np.linalg.pinv(s.free, rcond=1e-9, hermitian=True), s.rest)
+    most = float(np.max(taken))
+    after = max(s.chi2 - most, 1e-300)
+    p = float(f_sf(most / 3, 3, max(s.data.dof, 1.0)))
+    p = max(p, float(f_sf(most / 3 / (after / left), 3, left))) * n
+    return np.flatnonzero(taken > (1 - TIED) * most) if p < ALARM else np.zeros(0, dtype=int)
+
+
+# From ``u = P g + c`` to a sensor and the rotation of its frame: K, R and C of ``P
+# = K R C``.
+
+SECOND_ORDER = 0.2
+"""Share of a standard error from which on squares of the misalignments' errors
+are added to it."""
+
+
+def signs_of(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
+    """(3,) as declared, else those with which the sensor's frame lies nearest
+    to the table's."""
+    product = float(np.sign(np.linalg.det(s.P)))
+    if signs is not None:
+        flips = np.asarray(signs, dtype=float)
+        if float(np.prod(flips)) != product:
+            raise InvalidData(
+                f"the product of the signs is {np.prod(flips):+.0f}, but the attitudes say {product:+.0f}: a sign is "
+                "wrong, or the frame of the attitudes is left-handed"
+            )
+        return flips
+    choices = [np.array(f) for f in itertools.product((1.0, -1.0), repeat=3) if np.prod(f) == product]
+    return max(choices, key=lambda f: float(np.trace(sensor_and_rotation(s.P, s.c, f)[1])))
+
+
+def sensor_and_rotation(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Floats]:
+    """The sensor, its frame such that R is upper triangular and K has the signs
+    ``flips``, and the rotation C."""
+    KR, C = scipy.linalg.rq(P)
+    turn = flips * np.sign(np.diag(KR))
+    KR, C = KR * turn, turn[:, None] * C
+    k = np.diag(KR).copy()
+    R = KR / k[:, None]
+    return Sensor(k, np.array([R[1, 2], R[0, 2], R[0, 1]]), c / k), np.asarray(C)
+
+
+def parameters_by_entries(s: TurntableSolution, flips: Floats, C: Floats) -> Floats:
+    """(12,12) derivative of scale factor, misalignment, bias and turns of the
+    sensor's frame by P row by row and c."""
+
+    def of(p: Floats) -> Floats:
+        sensor, turned = sensor_and_rotation(p[:9].reshape(3, 3), p[9:], flips)
+        W = turned @ C.T
+        turns = np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]]) / 2
+        return np.concatenate([sensor.scale_factor, sensor.misalignment, sensor.bias, turns])
+
+    start = np.concatenate([s.P.ravel(), s.c])
+    sizes = np.concatenate([np.repeat(np.linalg.norm(s.P, axis=1), 3), np.linalg.norm(s.P, axis=1)])
+    steps = 1e-6 * sizes
+    return np.stack([(of(start + h) - of(start - h)) / (2 * h.sum()) for h in np.diag(steps)], axis=1)
+
+
+def second_order(covariance: Floats, sensor: Sensor, reference: float) -> Floats:
+    """(12,) what angles that are known so poorly do to scale factors and biases
+    by their squares, where this counts.
+
+    On six faces only attitudes tell the misalignments; an axis that is off by
+    an angle reads its cosine.
+    """
+    square = float(np.max(np.diag(covariance)[3:6]))
+    scale = np.abs(sensor.scale_factor) * square
+    if np.all(scale < SECOND_ORDER * np.sqrt(np.diag(covariance)[:3])):
+        return np.zeros(12)
+    return np.concatenate([scale, np.zeros(3), np.full(3, reference * square), np.zeros(3)])
+
 
 DILUTION_MOST = 100.0
 """Largest standard error of a combination of the twelve parameters, in errors
@@ -61,7 +416,7 @@ RAISED = 1.5
 worth a word."""
 FREE_LEAST = 1e-3
 """Poses of which less of the error shows as a residual are not judged by it."""
-PARAMETERS, LEFT_LEAST = 12, 6
+LEFT_LEAST = 6
 """Degrees of freedom below which the residual proves little: half a degree for
 each of the parameters."""
 WRONG_MOST = 0.25

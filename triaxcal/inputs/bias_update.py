@@ -25,7 +25,10 @@ from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.errors import NotStill, Refused
 from triaxcal.estimate.calibration import (
     BiasUpdate,
+    BirgeRatio,
     Calibration,
+    Caution,
+    FaultyPosesExcluded,
     HoldsAt,
     Origin,
     PoseResult,
@@ -33,7 +36,6 @@ from triaxcal.estimate.calibration import (
     pose_results,
     studentized,
 )
-from triaxcal.estimate.caution import BirgeRatio, Caution, FaultyPosesExcluded
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.model.bias_directions import (
     DILUTION_LIMIT,
@@ -44,7 +46,7 @@ from triaxcal.model.bias_directions import (
     first_distinct,
     wanted_for_biases,
 )
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.number_format import number_of, plain
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, SIGNIFICANT, lack_of_fit_p, within_pose_dof

@@ -17,8 +17,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual, pose_results, studentized
-from triaxcal.estimate.caution import Caution
+from triaxcal.estimate.calibration import Calibration, Caution, HoldsAt, PoseResult, Residual, pose_results, studentized
 from triaxcal.estimate.likelihood import Problem, State, linearise, parameters_by_theta
 from triaxcal.model.directions import dilution, linear_design
 from triaxcal.model.sensor import Sensor

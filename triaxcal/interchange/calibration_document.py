@@ -31,9 +31,8 @@ from triaxcal.rounding import (
     uncertainty,
 )
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcal.uncertainty.budget_statements import Basis, UnmodelledTemperature
-from triaxcal.uncertainty.next_recording import NextRecording, next_recording
-from triaxcal.uncertainty.scopes import Scopes
+from triaxcal.uncertainty.next_recording import NextRecording, Scopes, next_recording
+from triaxcal.uncertainty.statements import Basis, UnmodelledTemperature
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]

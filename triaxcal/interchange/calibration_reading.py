@@ -17,7 +17,7 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual, Unmodelled
 from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.units import reference_unit_of
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from triaxcal.diagnosis import Loop
 from triaxcal.estimate.recordings import residuals_by_run
-from triaxcal.evidence.shape_posterior import Shape
+from triaxcal.evidence.posterior import Shape
 from triaxcal.interchange.calibration_document import Document
 from triaxcal.pooled_units import Answer, PooledAnalysis, PooledEffect, SharedShape
 from triaxcal.rounding import chance, error, number, uncertainty

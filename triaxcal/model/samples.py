@@ -1,14 +1,26 @@
-"""The raw stream of one triad."""
+"""Which moment of its recording a calibration holds for."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData
+
+
+class Moment(StrEnum):
+    """By name; `SECONDS` where it is a number."""
+
+    END = "end"
+    MEAN = "mean"
+    SECONDS = "seconds"
+
+
+# The raw stream of one triad.
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME, Effect
+from triaxcal.effects.contract import TIME, Coefficient, Effect
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.initial_estimate import rough_directions, wanted_for
+from triaxcal.estimate.initial_estimate import rough_directions, started_problem, wanted_for
+from triaxcal.estimate.likelihood import Problem, State, linearise, residual_chi2, solve
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import (
     FULL,
@@ -27,12 +28,101 @@ from triaxcal.model.directions import (
     worst_error,
 )
 from triaxcal.model.sensor import LINEAR
-from triaxcal.planning.clock import PLANS_CLOCK
-from triaxcal.planning.design import Asked, ask, channels_needed, profile_times
-from triaxcal.planning.noise import fitted_beside, noise_of
+from triaxcal.planning.design import (
+    PLANS_CLOCK,
+    VISIBLE,
+    Asked,
+    OnPlansClock,
+    ask,
+    channels_needed,
+    combinations,
+    profile_times,
+)
 from triaxcal.planning.optimal import profile
 from triaxcal.poses.covariates import channels_of
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, within_pose_dof
 from triaxcal.poses.pose import Pose
+
+# The noise that a recording predicts: what its poses leave beside the effects that
+# a plan is for.
+
+
+@dataclass(frozen=True, eq=False)
+class Estimable(Effect):
+    """Those combinations ``seen`` (p,q) of the coefficients of ``effects``, all
+    together, that poses can show."""
+
+    effects: tuple[Effect, ...]
+    seen: Floats = field(repr=False)
+    name: str = "estimable"
+    remedy: str = ""
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"combination_{k + 1}", "g") for k in range(self.seen.shape[1]))
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(n for e in self.effects for n in e.needs))
+
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return np.concatenate([e.basis(s, covariates) for e in self.effects], axis=-1) @ self.seen
+
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return np.concatenate([e.slope(s, covariates) for e in self.effects], axis=-1) @ self.seen
+
+
+def fitted_beside(
+    poses: Sequence[Pose], effects: Sequence[Effect], *, signs: Sequence[float], reference: float
+) -> Calibration:
+    """The fit of the linear model with what the poses can show of ``effects``
+    beside it, so that this is no misfit.
+
+    An effect of a plan's clock has the shape that the poses show best. Raises
+    Refused as `fit` does; InvalidData where a channel that an effect needs is
+    not there.
+    """
+    sound = [p for p in poses if not p.fault]
+    linear = fit(sound, signs=signs, reference=reference)
+    if not effects:
+        return linear
+    problem, begin = started_problem(sound, signs=signs, reference=reference, effects=effects)
+    state = solve(problem, begin, ())
+    chosen = tuple(_shaped(problem, state, e) for e in effects)
+    _, J, s = linearise(problem, state.extended(chosen))
+    weighted = J / s[:, None]
+    seen, _ = combinations(weighted[:, :LINEAR], weighted[:, LINEAR:], VISIBLE)
+    if not seen.shape[1]:
+        return linear
+    try:
+        return fit(sound, signs=signs, reference=reference, effects=[Estimable(chosen, seen)])
+    except Refused:  # too far from the linear fit to be reckoned
+        return linear
+
+
+def _shaped(problem: Problem, state: State, effect: Effect) -> Effect:
+    if not isinstance(effect, OnPlansClock):
+        return effect
+    variants = effect.whole.variants(problem.covariates)
+    return min(variants, key=lambda e: residual_chi2(linearise(problem, state.extended([e]))))
+
+
+def noise_of(calibration: Calibration) -> Floats | None:
+    """(n,) standard errors of the poses used, as poses to come will have them,
+    in the unit of the reference; None where nothing tells them.
+
+    The noise inside the poses with the excess variance, and with a Birge ratio
+    only where residuals are significantly more than noise: to raise it for less
+    would on average promise too much, as no factor ever lowers it.
+    """
+    used = [p for p in calibration.poses if p.used]
+    error = np.array([p.error_g for p in used])
+    within = within_pose_dof([p.pose for p in used]) >= 1
+    if not within:
+        return error if len(used) > len(calibration.parameters) else None
+    p = calibration.residual.lack_of_fit_p
+    return error if p is not None and p < SIGNIFICANT else error / calibration.birge_ratio
+
 
 ENOUGH = 1.25
 """A set is good whose worst parameter is no more uncertain than this many
@@ -157,13 +247,22 @@ def _as_a_whole_plan(asked: Asked) -> float:
 
 
 @dataclass(frozen=True)
+class ChannelRange:
+    """From where to where a channel moved in a recording: both None where the
+    recording has no such channel, both the same where it stood still."""
+
+    lowest: float | None = None
+    highest: float | None = None
+
+
+@dataclass(frozen=True)
 class MissingPoses:
     """``had`` are the poses that carry a fit, None where they do not, and
     ``dilution`` that of the linear fit to them; ``wanted`` the poses to add;
     ``noise`` the standard error of a typical pose beside the effects, in parts
     of the reference; ``now`` the effects' standard errors without the poses to
     add, in that unit; ``absent`` the channels that the recording has not;
-    ``moves`` in words how the channels have to move."""
+    ``moves`` how far the channels that have to move did."""
 
     had: Had | None
     dilution: float | None
@@ -171,7 +270,7 @@ class MissingPoses:
     noise: float | None
     now: Mapping[str, Mapping[str, float | None]]
     absent: tuple[str, ...]
-    moves: dict[str, str]
+    moves: dict[str, ChannelRange]
 
 
 def missing_poses(
@@ -181,7 +280,7 @@ def missing_poses(
     asked_for = list(effects)
     logged = channels_of(list(poses)) if poses else {}
     absent = [c for c in channels_needed(asked_for) if c not in logged or not np.isfinite(logged[c]).all()]
-    moves = dict.fromkeys(absent, "is not in the recording: log it, and move it")
+    moves = dict.fromkeys(absent, ChannelRange())
     there = [e for e in asked_for if not set(e.needs) & set(absent)]
     asked = ask(there)
     if asked_for and not absent and asked.rank == 0:
@@ -202,7 +301,7 @@ def missing_poses(
     return MissingPoses(had, linear.dilution, additions(had, asked, first), noise, now, tuple(absent), moves)
 
 
-def _had_of(c: Calibration, moves: dict[str, str], channels: Sequence[str]) -> tuple[Had, float | None]:
+def _had_of(c: Calibration, moves: dict[str, ChannelRange], channels: Sequence[str]) -> tuple[Had, float | None]:
     used = [p for p in c.poses if p.used]
     error = noise_of(c)
     typical = None if error is None else float(np.sqrt(np.median(error**2)))
@@ -212,7 +311,9 @@ def _had_of(c: Calibration, moves: dict[str, str], channels: Sequence[str]) -> t
     return replace(had, axes=c.sensor.axes), None if typical is None else typical / c.reference
 
 
-def _had(up: Floats, weights: Floats, poses: Sequence[Pose], moves: dict[str, str], channels: Sequence[str]) -> Had:
+def _had(
+    up: Floats, weights: Floats, poses: Sequence[Pose], moves: dict[str, ChannelRange], channels: Sequence[str]
+) -> Had:
     """Adds to ``moves`` the channels that stood still."""
     held: dict[str, Floats] = {c: np.zeros(len(up)) for c in channels} | {TIME: profile_times(len(up))}
     half = dict.fromkeys((*channels, TIME), 1.0)
@@ -222,7 +323,7 @@ def _had(up: Floats, weights: Floats, poses: Sequence[Pose], moves: dict[str, st
             half[name] = span / 2
             held[name] = (values - values.min()) / half[name] - 1
             if name != TIME:
-                moves[name] = f"from {values.min():.4g} to {values.max():.4g} in the recording; levels are within that"
+                moves[name] = ChannelRange(float(values.min()), float(values.max()))
         elif name in channels:
-            moves[name] = f"stood still at {values[0]:.4g}: move it to either side of that"
+            moves[name] = ChannelRange(float(values[0]), float(values[0]))
     return Had(up, weights, held | {PLANS_CLOCK: held[TIME]}, half)

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME, Effect
-from triaxcal.model.directions import linear_design
+from triaxcal.effects import CATALOGUE
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
+from triaxcal.effects.runs import of_clocks
+from triaxcal.effects.wrapped import Wrapped
+from triaxcal.model.directions import FULL, linear_design
 from triaxcal.model.sensor import LINEAR
 
 SHOWS = 1e-6
@@ -141,3 +144,108 @@ def combinations(nuisance: Floats, columns: Floats, least: float = SHOWS) -> tup
     hidden = np.linalg.qr(rows[~kept].T / scale[:, None])[0] if not kept.all() else np.empty((len(size), 0))
     basis = np.linalg.svd(hidden, full_matrices=True)[0] if hidden.size else np.eye(len(size))
     return np.asarray(basis[:, hidden.shape[1] :]), np.asarray(hidden)
+
+
+# Effects of the recording's clock as a plan sees them, whose time runs from −1, the
+# first pose, to 1, the last.
+
+PLANS_CLOCK = "plans_clock"
+"""`TIME` from −1 to 1, where that itself is in seconds."""
+POSES = FULL + 1
+"""Of the plan that shapes are chosen for: the one of 26, its first pose
+repeated."""
+HELD_SHARE = 0.01
+"""How long a pose is held, where the plan is two long: an eighth of the time
+from pose to pose, so that a step falls between poses as a rule."""
+
+
+@dataclass(frozen=True)
+class OnPlansClock(Wrapped):
+    """``whole`` with a shape that suits a recording two units long, by
+    `PLANS_CLOCK`, or `TIME` where that is one."""
+
+    needs: tuple[str, ...] = (TIME,)
+
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.basis(s, _clocks(_plans(covariates)))
+
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.slope(s, _clocks(_plans(covariates)))
+
+
+def in_plan(effect: Effect) -> Effect:
+    """The effect as a plan can show it: of a time constant or a moment, the
+    middle one that would be tried."""
+    if not of_clocks(effect) or effect.needs == (TIME,):
+        return effect
+    variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))
+    return OnPlansClock(variants[len(variants) // 2])
+
+
+def _plans(covariates: Mapping[str, Floats]) -> Floats:
+    return covariates[PLANS_CLOCK] if PLANS_CLOCK in covariates else covariates[TIME]
+
+
+def _clocks(time: Floats) -> dict[str, Floats]:
+    return {TIME: time, SINCE_START: time + 1, DURATION: np.full(len(time), HELD_SHARE)}
+
+
+# What a set of poses can show of an effect: the part of it that the model cannot
+# absorb.
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a plan shows of one effect: ``visible`` of its ``of`` independent
+    coefficients.
+
+    ``hidden`` are the combinations of coefficients that do not show, name →
+    weight, unit vectors.
+    """
+
+    visible: int
+    of: int
+    hidden: tuple[Mapping[str, float], ...]
+
+
+def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Sight:
+    """What poses in these directions (n,3), in this order and evenly in time,
+    show of an effect by itself.
+
+    Every channel is taken to move freely, but for those ``held`` (n,).
+    """
+    n, effect = len(directions), in_plan(effect)
+    rng = np.random.default_rng(0)
+    covariates = {TIME: profile_times(n)} | {c: rng.standard_normal(n) for c in effect.needs if c != TIME}
+    covariates |= {c: v for c, v in (held or {}).items() if c in covariates}
+    seen, hidden = combinations(
+        linear_design(directions, directions), radial([effect], directions, covariates), VISIBLE
+    )
+    names = [c.name for c in effect.coefficients]
+    named = tuple({k: float(w) for k, w in zip(names, v, strict=True) if abs(w) > 1e-9} for v in _plainly(hidden.T))
+    return Sight(seen.shape[1], len(names), named)
+
+
+def _plainly(hidden: Floats) -> Floats:
+    """The same space of combinations (k,p), with as many weights zero as the
+    reduced echelon form has."""
+    rows = hidden.copy()
+    pivots = 0
+    for column in range(rows.shape[1]):
+        rest = np.abs(rows[pivots:, column])
+        if pivots == len(rows) or rest.max(initial=0.0) < 1e-6:
+            continue
+        k = pivots + int(np.argmax(rest))
+        rows[[pivots, k]] = rows[[k, pivots]]
+        rows[pivots] /= rows[pivots, column]
+        others = np.arange(len(rows)) != pivots
+        rows[others] -= np.outer(rows[others, column], rows[pivots])
+        pivots += 1
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+
+
+def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
+    """Names of the effects that poses in these directions (n,3) cannot show in
+    full, were every channel moving freely."""
+    sights = [sight(directions, e) for e in catalogue]
+    return [e.name for e, s in zip(catalogue, sights, strict=True) if s.visible < s.of]

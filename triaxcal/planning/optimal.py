@@ -22,8 +22,7 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
-from triaxcal.model.directions import Direction, cube_directions, directions, linear_design, worst_error
-from triaxcal.model.order import in_order
+from triaxcal.model.directions import Direction, cube_directions, directions, in_order, linear_design, worst_error
 from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.design import Asked, ask, channels_needed, needs_time, profile_times
 

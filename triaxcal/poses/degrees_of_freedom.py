@@ -14,7 +14,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, f_sf
-from triaxcal.poses.mean_variance_mixture import NoiseLevels
+from triaxcal.poses.noise_spectrum import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 LACK_OF_FIT = 0.01

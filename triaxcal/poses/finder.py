@@ -8,7 +8,8 @@ from typing import Any
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 
 
 class PoseFinder:

@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 
 from triaxcal.diagnosis import Loop, Recommendation, Verdict
 from triaxcal.effects.plugins import package_of
-from triaxcal.evidence.candidate_actions import Action, ActionKind
-from triaxcal.evidence.identifiability import NotIdentifiable, Why
+from triaxcal.evidence.findings import NotIdentifiable, Why
 from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.next_measurement import Action, ActionKind
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.number_format import plain
+from triaxcal.planning.addition import ChannelRange
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.units import ErrorUnit
@@ -154,6 +155,15 @@ def _direction(action: Action) -> str:
     if action.label or action.up is None:
         return action.label
     return "up along (" + ", ".join(f"{v:+.2f}" for v in action.up) + ")"
+
+
+def to_move(channel: ChannelRange) -> str:
+    """How a channel has to move in poses to come."""
+    if channel.lowest is None or channel.highest is None:
+        return "is not in the recording: log it, and move it"
+    if channel.lowest == channel.highest:
+        return f"stood still at {channel.lowest:.4g}: move it to either side of that"
+    return f"from {channel.lowest:.4g} to {channel.highest:.4g} in the recording; levels are within that"
 
 
 def blind(why: NotIdentifiable) -> str:

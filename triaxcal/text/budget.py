@@ -8,7 +8,7 @@ from functools import singledispatch
 
 from triaxcal.number_format import micro_g
 from triaxcal.text.cautions import excess
-from triaxcal.uncertainty import budget_statements as of
+from triaxcal.uncertainty import statements as of
 
 AS_STATED = "as stated"
 

@@ -7,14 +7,13 @@ from functools import singledispatch
 
 import numpy as np
 
-from triaxcal.estimate import caution as of_fit
+from triaxcal.estimate import calibration as of_fit
 from triaxcal.frames import faces, frames, orientations, standing
-from triaxcal.inputs import attitude_cautions as attitude
-from triaxcal.inputs import bias_update, datasheet
+from triaxcal.inputs import attitude, bias_update, datasheet
 from triaxcal.inputs.turning import rotation
 from triaxcal.number_format import micro_g, number_of, plain
 from triaxcal.poses.pose_in_words import moment, the_poses
-from triaxcal.uncertainty import extrapolation
+from triaxcal.uncertainty.propagation import Extrapolated
 
 RAISED = "the standard errors are raised by that"
 
@@ -100,7 +99,7 @@ def _(_: of_fit.ResidualsTooSmall) -> str:
 
 
 @caution.register
-def _(c: extrapolation.Extrapolated) -> str:
+def _(c: Extrapolated) -> str:
     return (
         f"the calibration is to hold {c.beyond_s:.0f} s after the last pose: what effects of time make of the "
         f"readings there has a standard uncertainty of {micro_g(c.uncertainty_g)}"

@@ -18,7 +18,7 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.estimate.calibration import HoldsAt
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.number_format import plain
 
 

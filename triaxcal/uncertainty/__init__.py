@@ -10,7 +10,7 @@ sources are weighed by.
 
 from triaxcal.uncertainty.budget import Budget, Combined, budget
 from triaxcal.uncertainty.components import Component
-from triaxcal.uncertainty.stated import Stated
+from triaxcal.uncertainty.statements import Stated
 from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K
 
 __all__ = ["SENSITIVITY_PER_K", "Budget", "Combined", "Component", "Stated", "budget"]

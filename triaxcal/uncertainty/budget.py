@@ -13,17 +13,17 @@ from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
-from triaxcal.uncertainty.budget_statements import (
+from triaxcal.uncertainty.components import Component, not_held, of_update, reference, rounding, statistical, unmodelled
+from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
+from triaxcal.uncertainty.statements import (
     NotEvaluated,
     PosesWithoutScatter,
     ReferenceTakenAsExact,
     SingleReading,
+    Stated,
     TemperatureNotLogged,
     ThermometerNotStated,
 )
-from triaxcal.uncertainty.components import Component, not_held, of_update, reference, rounding, statistical, unmodelled
-from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
-from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
 
 LEVEL = 0.95

@@ -12,7 +12,8 @@ from triaxcal.arrays import Floats
 from triaxcal.estimate.calibration import BiasUpdate, Calibration
 from triaxcal.poses.degrees_of_freedom import within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.uncertainty.budget_statements import (
+from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
+from triaxcal.uncertainty.statements import (
     AveragedModels,
     Basis,
     BirgeFactor,
@@ -32,10 +33,9 @@ from triaxcal.uncertainty.budget_statements import (
     ReferenceKnown,
     RegisterSteps,
     Remedy,
+    Stated,
     WithinPoseScatter,
 )
-from triaxcal.uncertainty.propagation import ErrorPropagation, SphereMean
-from triaxcal.uncertainty.stated import Stated
 
 CERTAIN = 0.99
 """Effects of this probability do not compete."""

@@ -3,18 +3,20 @@ parameters, and from these to |a|."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.excess import Excess
+from triaxcal.effects.contract import SINCE_START, TIME, Effect, reshaped
+from triaxcal.estimate.calibration import Calibration, Caution, Unmodelled
+from triaxcal.estimate.creep import with_slopes
+from triaxcal.estimate.fit_assessment import Excess
 from triaxcal.estimate.initial_estimate import problem_of, with_history
 from triaxcal.estimate.likelihood import Problem, State, by_shape, linearise, linearise_all, parameters_by_theta
-from triaxcal.estimate.pose_slopes import with_slopes
 from triaxcal.model.directions import spiral
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
 
 SPHERE = 200
@@ -118,3 +120,116 @@ def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     gain[free] = np.linalg.pinv(np.concatenate([weighted[:, free] / norms, prior_rows]), rcond=1e-13)[:, :n]
     gain[free] /= norms[:, None]
     return gain
+
+
+# A calibration that is to hold for a moment after its recording: how well effects
+# of time are known there.
+
+STEP = 1e-4
+"""Relative step of the derivative by a shape, far above rounding and far below
+the curvature of any effect."""
+FACES = np.concatenate([np.eye(3), -np.eye(3)])
+"""(6,3) up along each sensitive axis, both ways, where a bias shows whole."""
+
+
+@dataclass(frozen=True)
+class Extrapolated(Caution):
+    """It holds ``beyond_s`` after the last pose; what effects of time make of
+    the readings there has this standard uncertainty (of the axis and the face
+    where it is largest), in the unit of the reference vector."""
+
+    beyond_s: float
+    uncertainty_g: float
+
+
+def extrapolated(c: Calibration) -> Extrapolated | None:
+    """None where the moment lies within the recording, or no effect goes with
+    time."""
+    if c.holds_at is None or not c.poses:
+        return None
+    last = max(p.pose.run.index for p in c.poses)
+    beyond_s = c.holds_at.t_s - max(p.pose.end_s for p in c.poses if p.pose.run.index == last)
+    at, variance = 9, np.zeros(len(FACES) * 3)
+    for effect, q in c.sensor.effects:
+        own = slice(at, at + len(q))
+        at += len(q)
+        if {TIME, SINCE_START} & set(effect.needs):
+            B = _basis(effect, c)
+            variance += np.einsum("ap,pq,aq->a", B, c.covariance[own, own], B)
+            if c.prior_sd is None:  # what an average does not know of a shape is in its covariance
+                variance += _by_shapes(effect, q, c) ** 2
+    if beyond_s <= 0 or not variance.any():
+        return None
+    return Extrapolated(float(beyond_s), float(np.sqrt(variance.max())))
+
+
+def _basis(effect: Effect, c: Calibration) -> Floats:
+    """(18,p) at the moment, on each face and axis, with everything else at its
+    reference."""
+    needed = {name: c.channel_reference[name] for name in effect.needs}
+    basis = effect.basis(c.reference * FACES, at_moment(needed, len(FACES), c.moment))
+    return np.asarray(basis.reshape(-1, basis.shape[-1]))
+
+
+def _by_shapes(effect: Effect, q: Floats, c: Calibration) -> Floats:
+    """(18,) what the standard errors of its shapes make of it."""
+    parts: Sequence[Floats] = [
+        (_basis(reshaped(effect, name, value * (1 + STEP)), c) - _basis(effect, c)) @ q / (STEP * value) * error
+        for name, (value, _) in effect.shape.items()
+        if value and (error := c.shape_errors.get(f"{effect.name}.{name}"))
+    ]
+    return np.asarray(np.linalg.norm(np.array(parts).reshape(-1, len(FACES) * 3), axis=0))
+
+
+# The standard uncertainty that a calibration gives the readings which it is applied
+# to.
+
+NOTHING = Unmodelled(0.0, 0.0)
+"""Where nothing acts beside the covariance."""
+
+
+def uncertainty_of_readings(
+    sensor: Sensor,
+    covariance: Floats,
+    u: Floats,
+    covariates: Mapping[str, Floats],
+    unmodelled: Unmodelled | None = None,
+) -> Floats:
+    """(n,3) of the specific force at outputs u (n,3), for a ``covariance``
+    (p,p) of the sensor's parameters, and what acts beside them; NaN where the
+    covariance is not known."""
+    beside = unmodelled or NOTHING
+    variance = np.zeros(u.shape)
+    if beside != NOTHING:
+        square = sensor.up(u, covariates) ** 2
+        variance += beside.along**2 * square + beside.across**2 * (1 - square)
+    for step in _steps(sensor, covariance, u, covariates):
+        variance += step**2
+    return np.asarray(np.sqrt(variance))
+
+
+def uncertainty_of_magnitude(
+    sensor: Sensor,
+    covariance: Floats,
+    u: Floats,
+    covariates: Mapping[str, Floats],
+    unmodelled: Unmodelled | None = None,
+) -> Floats:
+    """(n,) likewise of |a|."""
+    up = sensor.up(u, covariates)
+    variance = np.full(len(u), (unmodelled or NOTHING).along ** 2)
+    for step in _steps(sensor, covariance, u, covariates):
+        variance += np.sum(step * up, axis=1) ** 2
+    return np.asarray(np.sqrt(variance))
+
+
+def _steps(sensor: Sensor, covariance: Floats, u: Floats, covariates: Mapping[str, Floats]) -> Iterator[Floats]:
+    """(n,3) each: one standard error along each principal axis of the
+    covariance, and what it does."""
+    if not np.isfinite(covariance).all():
+        yield np.full(u.shape, np.nan)
+        return
+    size, axes = np.linalg.eigh(covariance)
+    a = sensor.specific_force(u, covariates)
+    for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
+        yield sensor.moved(step).specific_force(u, covariates) - a

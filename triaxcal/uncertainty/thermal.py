@@ -17,20 +17,20 @@ from triaxcal.effects.odds import EFFECT_ODDS, SIZES, SMALLEST, on_axes
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import linearise_all
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, noise_levels
-from triaxcal.poses.mean_variance_mixture import NoiseLevels
-from triaxcal.uncertainty.budget_statements import (
+from triaxcal.poses.noise_spectrum import NoiseLevels
+from triaxcal.uncertainty.components import Component, half_the_noise, positive_semidefinite
+from triaxcal.uncertainty.propagation import ErrorPropagation
+from triaxcal.uncertainty.statements import (
     PosesAtOtherTemperatures,
     ProbableTemperature,
     Remedy,
+    Stated,
     SteadierTemperature,
     TemperatureKnown,
     TemperatureModelled,
     ThermometerAt,
     UnmodelledTemperature,
 )
-from triaxcal.uncertainty.components import Component, half_the_noise, positive_semidefinite
-from triaxcal.uncertainty.propagation import ErrorPropagation
-from triaxcal.uncertainty.stated import Stated
 
 SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from triaxcal.model.gravity import HEIGHTS_M
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal_drivers.nearest import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable

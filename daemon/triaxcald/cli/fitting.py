@@ -13,7 +13,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.interchange.calibration_document import Document, calibration_document
 from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.pooled_units import pooled_analysis
 from triaxcal.poses.pose import Pose
 from triaxcal.progress import Stage

@@ -21,8 +21,7 @@ from triaxcal.frames.standing import Standing, stand
 from triaxcal.interchange.calibration_reading import but_is, sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.number_format import probability
-from triaxcal.poses.stillness.detector import find_spans
-from triaxcal.poses.stillness.turns import TURN_S
+from triaxcal.poses.stillness.detector import TURN_S, find_spans
 from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable

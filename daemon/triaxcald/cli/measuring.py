@@ -14,10 +14,11 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import magnitude_errors
-from triaxcal.estimate.unit_identity import shape_beside, shape_in, unlike_shapes
+from triaxcal.estimate.recordings import shape_beside, shape_in
 from triaxcal.interchange.calibration_document import poses_document
 from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.rounding import error
+from triaxcal.text.pooled_units import other_unit
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.console import emit, show
 from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
@@ -76,7 +77,7 @@ def verify_command(a: argparse.Namespace) -> int:
     warnings = unlike(measured.name, found.rms_g, reference)
     if not warnings:
         held = shape_in(calibration_part(document, where=a.calibration))
-        warnings = unlike_shapes(a.calibration, measured.name, held, shape_beside(model, measured.poses))
+        warnings = other_unit(a.calibration, measured.name, held, shape_beside(model, measured.poses))
     warnings += _of_its_recording(model, a.calibration)
     result = {
         "format": "triaxcal.verify/1",

@@ -25,11 +25,10 @@ from triaxcal.model.directions import (
     worst_error,
 )
 from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
-from triaxcal.planning.clock import in_plan
-from triaxcal.planning.design import Asked, ask, needs_time
+from triaxcal.planning.design import Asked, Sight, ask, in_plan, needs_time, sight, unseen_effects
 from triaxcal.planning.optimal import OptimalPlan, optimal
-from triaxcal.planning.visibility import Sight, sight, unseen_effects
 from triaxcal.rounding import number, numbers, uncertainty
+from triaxcal.text.advice import to_move
 from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
@@ -236,7 +235,7 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
             "for": [e.name for e in effects],
             "promised": _errors(_of_all(effects, found.now), found.noise),
             "cannot_show": _not_shown(found, effects),
-            "moves": found.moves,
+            "moves": {name: to_move(channel) for name, channel in found.moves.items()},
         }
     document["data_quality"] = measured.data_quality
     if a.json:
@@ -255,8 +254,8 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
             _show_errors(found.wanted[-1].errors, found.noise, "with them")
     for why in document.get("cannot_show", {}).values():
         show(why)
-    for name, text in found.moves.items():
-        show(f"{name}: {text}")
+    for name, channel in found.moves.items():
+        show(f"{name}: {to_move(channel)}")
     if sights is not None:
         show(f"the {len(had)} there are cannot show: {_list(document['blind_to'])}")
     warn(measured.data_quality)

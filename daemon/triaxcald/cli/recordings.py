@@ -16,10 +16,10 @@ from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say, show
 from triaxcald.cli.progress import at
+from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
-from triaxcald.pipeline import DecodedStream, beside_samples
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe

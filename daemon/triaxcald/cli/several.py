@@ -11,12 +11,11 @@ from pathlib import Path
 
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
-from triaxcal.estimate.recordings import residuals_by_run, together
-from triaxcal.estimate.unit_identity import shape_by_poses, shape_of, unlike_shapes
+from triaxcal.estimate.recordings import residuals_by_run, shape_by_poses, shape_of, together
 from triaxcal.number_format import plain
 from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
-from triaxcal.text.pooled_units import verdict
+from triaxcal.text.pooled_units import other_unit, verdict
 from triaxcald.cli.console import show, table
 from triaxcald.cli.results import WORTH_A_LINE, chance_of
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
@@ -122,7 +121,7 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choic
         return said
     shapes = [(m.name, shape_by_poses(m.poses, choice.signs, choice.reference)) for m in recordings]
     known = [(name, shape) for name, shape in shapes if shape is not None]
-    return [line for name, shape in known[1:] for line in unlike_shapes(known[0][0], name, known[0][1], shape)]
+    return [line for name, shape in known[1:] for line in other_unit(known[0][0], name, known[0][1], shape)]
 
 
 def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Choice) -> list[str]:
@@ -132,7 +131,7 @@ def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Cho
     if said := unlike(check.name, loop.held_out.before_rms_g, choice.reference):
         return said
     own = shape_by_poses(check.poses, choice.signs, choice.reference)
-    return unlike_shapes(measured.name, check.name, shape_of(loop.before), own)
+    return other_unit(measured.name, check.name, shape_of(loop.before), own)
 
 
 def _serial(m: Measured) -> str | None:

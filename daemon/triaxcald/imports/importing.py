@@ -14,11 +14,11 @@ from typing import Any
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import Decoder, RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
+from triaxcald.decoded import only_finite
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
 from triaxcald.imports.times import Times
 from triaxcald.inputs import CALIBRATION, PROFILE
-from triaxcald.pipeline import only_finite
 from triaxcald.recording import disk
 from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic, preview_channels
 from triaxcald.recording.writer import RecordingWriter

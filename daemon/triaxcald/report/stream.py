@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.detector import Windows
+from triaxcal.poses.stillness.windows import Windows
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
-from triaxcald.certificate import Certified, certify, software, why_not_written
+from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
@@ -55,6 +55,7 @@ from triaxcald.run.endings import aborted, judged
 from triaxcald.run.session import UnitSession
 from triaxcald.run.together import side_by_side
 from triaxcald.run.write_back import WriteBack, corrected
+from triaxcald.software import software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.coming_back import AtWork, Patience, Streaming
 from triaxcald.station.config import Place, Station

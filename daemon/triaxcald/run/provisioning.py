@@ -17,7 +17,6 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
-from triaxcald.certificate import software
 from triaxcald.documents import to_text
 from triaxcald.errors import Implausible, InputError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT
@@ -43,6 +42,7 @@ from triaxcald.provision.unfinished import journaled_image
 from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
+from triaxcald.software import software
 from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import doubts_of_live_output
 from triaxcald.station.power import power_cycle_asked

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
 from triaxcal.model.gravity import local_gravity_g
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of

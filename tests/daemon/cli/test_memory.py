@@ -23,7 +23,8 @@ from triaxcald.exit_codes import exit_code_of
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording.file import RecordingFile
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.endings import aborted, reason_of, trace_of
+from triaxcald.run.endings import aborted
+from triaxcald.run.reasons import reason_of, trace_of
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
 TOO_MUCH = 2**60

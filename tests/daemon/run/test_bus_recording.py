@@ -18,8 +18,8 @@ import pytest
 from tests.daemon.run.test_unit_recording import Bench, Told, recorded
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.profile import READINGS
+from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
-from triaxcald.pipeline import DecodedStream
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.bus import frame_rows
 from triaxcald.recording.reader import Recording

@@ -14,8 +14,8 @@ import pytest
 from tests.daemon.station.test_lock import another_process
 from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.profile import READINGS
+from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
-from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import Kept, State
 from triaxcald.run.roster import Roster

@@ -19,8 +19,8 @@ from triaxcal_drivers.can.receive import OVERFLOW
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.loading import BUILT_IN
 from triaxcal_drivers.profile import READINGS
+from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
-from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import State
 from triaxcald.run.session import UnitSession

@@ -13,10 +13,10 @@ from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import BEFORE
 from triaxcal.effects.nonlinear import KINDS, KNEES, Compression
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.identifiability import NotIdentifiable, Why
+from triaxcal.evidence.findings import NotIdentifiable, Why
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.visibility import sight
+from triaxcal.planning.design import sight
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

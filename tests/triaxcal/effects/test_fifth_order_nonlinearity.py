@@ -11,11 +11,10 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.nonlinear import FifthOrderNonlinearity
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.identifiability import NotIdentifiable, Why
+from triaxcal.evidence.findings import NotIdentifiable, Why
 from triaxcal.model.directions import directions, linear_design
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.design import combinations, radial
-from triaxcal.planning.visibility import sight
+from triaxcal.planning.design import combinations, radial, sight
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from triaxcal.errors import Refused
-from triaxcal.estimate.ellipsoid import closed_form, coefficients
+from triaxcal.estimate.initial_estimate import closed_form, coefficients
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.diagnosis import diagnose
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.fit_assessment import Excess
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.poses.pose import Pose
 

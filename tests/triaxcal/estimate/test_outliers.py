@@ -12,16 +12,16 @@ from scipy import stats
 from benchmarks.outliers import clean_loses, measure
 from benchmarks.truth import plan
 from triaxcal.effects.memory import Hysteresis
-from triaxcal.estimate.calibration import Calibration, Exclusion
-from triaxcal.estimate.caution import (
+from triaxcal.estimate.calibration import (
+    Calibration,
     Caution,
     ExcludedPose,
+    Exclusion,
     OutliersExcluded,
     PosesExcludedByCaller,
     UnknownHistoryExcluded,
 )
-from triaxcal.estimate.outliers import not_as_predicted, outlier_set
-from triaxcal.estimate.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit, not_as_predicted, outlier_set
 from triaxcal.model.directions import linear_design
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

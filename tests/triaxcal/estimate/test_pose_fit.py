@@ -13,8 +13,7 @@ from scipy import stats
 from triaxcal.effects import CATALOGUE, TIME, effect_named
 from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.calibration import Exclusion
-from triaxcal.estimate.caution import ExcessVariance, FaultyPosesExcluded
+from triaxcal.estimate.calibration import ExcessVariance, Exclusion, FaultyPosesExcluded
 from triaxcal.estimate.initial_estimate import problem_of, start, with_history
 from triaxcal.estimate.likelihood import Problem, State, linearise, solve
 from triaxcal.estimate.pose_fit import fit

@@ -14,12 +14,11 @@ from triaxcal.effects import effect_named
 from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
 from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
-from triaxcal.estimate.cross_validation import cross_validated
-from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.creep import PoseSlopes, left_by_slopes, slopes_p, with_slopes
+from triaxcal.estimate.fit_assessment import Excess, cross_validated
 from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import State, linearise, linearise_all, residual_sum_of_squares, solve
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.pose_slopes import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.evidence import Posterior, Refusal, posterior_of
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import Sensor

@@ -13,7 +13,7 @@ from triaxcal.estimate.calibration import Calibration, HoldsAt
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.projected_calibration import reduced
 from triaxcal.model.directions import directions
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

@@ -10,11 +10,12 @@ import pytest
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.unit_identity import Shape, shape_beside, shape_by_poses, shape_in, shape_of, unlike_shapes
+from triaxcal.estimate.recordings import Shape, shape_beside, shape_by_poses, shape_in, shape_of
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
+from triaxcal.text.pooled_units import other_unit
 
 KNOWN = 1e-5
 """Standard error of scale factors, as a share, and of misalignments [rad]."""
@@ -31,7 +32,7 @@ def _shape(
 
 
 def _asked(one: Shape | None, another: Shape | None) -> bool:
-    return bool(unlike_shapes("a.csv", "b.csv", one, another))
+    return bool(other_unit("a.csv", "b.csv", one, another))
 
 
 @pytest.mark.parametrize(
@@ -48,7 +49,7 @@ def test_what_age_and_temperature_do_to_a_unit_is_not_asked_about(other: Shape) 
 
 
 def test_a_unit_of_other_misalignment_or_of_other_ratios_of_scale_factors_is_asked_about_in_one_line() -> None:
-    (line,) = unlike_shapes("a.csv", "b.csv", _shape(), _shape((2.0, 2.02, 2.02), (8e-3, 0.0, -5e-3)))
+    (line,) = other_unit("a.csv", "b.csv", _shape(), _shape((2.0, 2.02, 2.02), (8e-3, 0.0, -5e-3)))
     assert line.startswith("a.csv and b.csv: misalignment differs by up to 8 mrad and the ratio of scale factors by ")
     assert line.endswith("by up to 1 %, more than age and 20 K make of one unit: the same unit?")
     assert _asked(_shape(), _shape(misalignment=(0.0, 8e-3, 0.0)))

@@ -13,12 +13,12 @@ from triaxcal.estimate.calibration import Calibration, HoldsAt
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
 from triaxcal.evidence.corrected_calibration import corrected
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.extrapolation import Extrapolated
+from triaxcal.uncertainty.propagation import Extrapolated
 
 Poses = Callable[..., list[Pose]]
 START = HoldsAt(Moment.SECONDS, 0.0, 0.0)

@@ -14,7 +14,7 @@ from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, SINCE_START, TIME
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Action, ActionKind, Advice, Posterior, advice, posterior_of
-from triaxcal.evidence.information_gain import LEAST
+from triaxcal.evidence.next_measurement import LEAST
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

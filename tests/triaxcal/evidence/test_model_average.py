@@ -14,7 +14,7 @@ from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Average, Posterior, Refusal, average, posterior_of, refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 

@@ -21,7 +21,7 @@ from triaxcal.model.directions import directions, spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
-from triaxcal.uncertainty.readings import uncertainty_of_magnitude, uncertainty_of_readings
+from triaxcal.uncertainty.propagation import uncertainty_of_magnitude, uncertainty_of_readings
 
 CATALOGUE = (*FEW, CrossCoupling())
 SPHERE = spiral(60)

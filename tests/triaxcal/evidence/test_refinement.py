@@ -12,7 +12,7 @@ from triaxcal.effects.time import MOMENTS
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.refinement import posterior_of
+from triaxcal.evidence.search import posterior_of
 from triaxcal.evidence.terms import CHANGE_POINTS
 
 MANY = 260

@@ -11,12 +11,11 @@ from tests.half_turns import HANDS, stood
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import labelled
 from triaxcal.frames.frames import frames
+from triaxcal.frames.orientations import verticals
 from triaxcal.frames.standing import stand
-from triaxcal.frames.verticals import verticals
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import poses_of
-from triaxcal.poses.stillness.detector import StillnessDetector
-from triaxcal.poses.stillness.turns import TURN_S
+from triaxcal.poses.stillness.detector import TURN_S, StillnessDetector
 
 SEEDS = 10
 

@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
-from triaxcal.inputs.attitude_cautions import (
+from triaxcal.inputs.attitude import (
     AttitudeExcluded,
+    AttitudeFit,
     AttitudesContradict,
     AttitudesTied,
     DeclaredErrorContradicted,
     MagnitudeContradicts,
+    fit_attitudes,
 )
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor

@@ -19,7 +19,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.inputs.bias_update import SCALE_FACTOR_SHARE, BiasMoved, Earlier, updated_biases
 from triaxcal.model.bias_directions import bias_directions
 from triaxcal.model.directions import cube_directions
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses

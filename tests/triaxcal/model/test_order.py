@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.model.directions import closed, cube_directions, directions
-from triaxcal.model.order import in_order
+from triaxcal.model.directions import closed, cube_directions, directions, in_order
 
 
 def taken(plan: list[tuple[str, np.ndarray]]) -> np.ndarray:

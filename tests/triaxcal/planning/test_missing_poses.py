@@ -12,7 +12,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import closed, directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.addition import MissingPoses, missing_poses
-from triaxcal.planning.clock import in_plan
+from triaxcal.planning.design import in_plan
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 

@@ -11,7 +11,7 @@ import pytest
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
 from triaxcal.model.directions import directions
-from triaxcal.planning.visibility import sight, unseen_effects
+from triaxcal.planning.design import sight, unseen_effects
 
 
 def test_fourteen_poses_show_the_second_order_but_not_the_third(fourteen: np.ndarray) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from triaxcal.poses import mean_noise
+from triaxcal.poses import pose_noise
 from triaxcal.poses.pose import poses_of
 from triaxcal.synthetic import Tumble
 
@@ -37,8 +37,8 @@ def test_averages_of_windows_show_the_noise_as_well_as_the_windows_do(
         noise = lfilter([1.0], [1.0, -keeps], white, axis=0) * 2e-4
         windows, spans, fine = detect(t_s, path.specific_force(t_s) + noise)
         with monkeypatch.context() as patched:
-            patched.setattr(mean_noise, "LONGEST", 100)
-            patched.setattr(mean_noise, "SHORTEST", 20)
+            patched.setattr(pose_noise, "LONGEST", 100)
+            patched.setattr(pose_noise, "SHORTEST", 20)
             coarse = poses_of(windows, spans)
         changed |= any((c.covariance != f.covariance).any() for c, f in zip(coarse, fine, strict=True))
         ratios += [(p.standard_error / 2e-4) ** 2 / variance_of_mean(p.samples, keeps) for p in coarse]
@@ -47,8 +47,8 @@ def test_averages_of_windows_show_the_noise_as_well_as_the_windows_do(
 
 
 def test_windows_are_averaged_as_far_as_the_shortest_pose_allows() -> None:
-    most, least = mean_noise.LONGEST, mean_noise.SHORTEST
-    assert mean_noise._averaged_at_once([least, most]) == 1
-    assert mean_noise._averaged_at_once([600, 864_000]) == 8
-    assert mean_noise._averaged_at_once([2 * least, 864_000]) == 2
-    assert mean_noise._averaged_at_once([least, 864_000]) == 1
+    most, least = pose_noise.LONGEST, pose_noise.SHORTEST
+    assert pose_noise._averaged_at_once([least, most]) == 1
+    assert pose_noise._averaged_at_once([600, 864_000]) == 8
+    assert pose_noise._averaged_at_once([2 * least, 864_000]) == 2
+    assert pose_noise._averaged_at_once([least, 864_000]) == 1

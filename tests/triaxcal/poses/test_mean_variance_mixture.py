@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from triaxcal.poses.mean_variance_mixture import DOF_LEVEL, NoiseLevels
+from triaxcal.poses.noise_spectrum import DOF_LEVEL, NoiseLevels
 
 TWO = NoiseLevels.of(np.array([0.8, 0.2]), np.array([2.0, 9.0]), np.array([200.0, 40.0]))
 

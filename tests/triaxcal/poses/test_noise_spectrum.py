@@ -10,8 +10,7 @@ from scipy import integrate, linalg, stats
 
 from benchmarks.noise import first_order, flicker, moving_average, white
 from triaxcal.poses import noise_spectrum
-from triaxcal.poses.mean_variance_mixture import NoiseLevels
-from triaxcal.poses.noise_spectrum import SLOWEST, Components, Spectrum, Track, periodogram
+from triaxcal.poses.noise_spectrum import SLOWEST, Components, NoiseLevels, Spectrum, Track, periodogram
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import WindowCutter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.poses.stream_covariates import InStream, followed
+from triaxcal.poses.covariates import InStream, followed
 
 T = np.arange(0.0, 120.0, 0.01)
 

@@ -10,9 +10,9 @@ import pytest
 from benchmarks.noise import first_order, white
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose import poses_of
+from triaxcal.poses.pose_noise import without_tones
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import WindowCutter
-from triaxcal.poses.tones import without_tones
 
 NOISES = [(white, ()), (first_order, (5.0,))]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from triaxcal.text import basis, not_evaluated, remedy
-from triaxcal.uncertainty import budget_statements as of
+from triaxcal.uncertainty import statements as of
 
 THERMAL = ("temperature_bias", "temperature_scale_factor")
 BASES: list[tuple[of.Basis, str]] = [

@@ -8,7 +8,7 @@ import pkgutil
 import pytest
 
 import triaxcal
-from triaxcal.estimate.caution import (
+from triaxcal.estimate.calibration import (
     BirgeRatio,
     Caution,
     ExcessVariance,
@@ -24,7 +24,7 @@ from triaxcal.estimate.caution import (
 )
 from triaxcal.frames.orientations import NotFlush
 from triaxcal.frames.standing import SingleOrientation
-from triaxcal.inputs.attitude_cautions import (
+from triaxcal.inputs.attitude import (
     AttitudeExcluded,
     AttitudesTied,
     DeclaredErrorContradicted,

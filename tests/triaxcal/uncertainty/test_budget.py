@@ -16,7 +16,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import SENSITIVITY_PER_K, Stated, budget
-from triaxcal.uncertainty.budget_statements import ReferenceTakenAsExact, SingleReading, TemperatureNotLogged
+from triaxcal.uncertainty.statements import ReferenceTakenAsExact, SingleReading, TemperatureNotLogged
 
 NOISE = 2e-5
 SIGNS = (-1, -1, -1)

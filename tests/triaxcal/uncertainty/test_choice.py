@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.diagnosis import diagnose
-from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.budget_statements import AveragedModels
+from triaxcal.uncertainty.statements import AveragedModels
 
 
 def one_after_the_other(poses: list[Pose], every_s: float, duration_s: float) -> list[Pose]:

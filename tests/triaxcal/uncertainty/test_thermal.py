@@ -15,7 +15,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Component, Stated, budget
-from triaxcal.uncertainty.budget_statements import (
+from triaxcal.uncertainty.statements import (
     LongerOrMorePoses,
     PosesAtOtherTemperatures,
     SteadierTemperature,

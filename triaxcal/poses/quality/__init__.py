@@ -1,8 +1,7 @@
 """What the raw stream is to be blamed for, found before any fit: rails, frozen
 outputs, gaps, mains, coarse steps."""
 
-from triaxcal.poses.quality.detector import QualityDetector
-from triaxcal.poses.quality.disturbed import disturbances
+from triaxcal.poses.quality.detector import QualityDetector, disturbances
 from triaxcal.poses.quality.finding import Finding, untrusted_poses
 
 __all__ = ["Finding", "QualityDetector", "disturbances", "untrusted_poses"]

@@ -4,25 +4,41 @@ data quality need.
 The stream is cut anew into chunks that depend on the samples alone, so that
 live and replayed streams are judged alike. Memory grows with time, not with the
 sample rate: about a hundred bytes for each tenth of a second, and for the first
-hours three thousand for a second of spectra.
-"""
+hours three thousand for a second of spectra."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import faults, mains
-from triaxcal.poses.quality.extremes import CellKeeper, StepEstimator
-from triaxcal.poses.quality.finding import Finding, MissingSamples, StillIntervals
-from triaxcal.poses.quality.run_lengths import RunLengths
-from triaxcal.poses.quality.timing import Gaps
+from triaxcal.poses.quality.faults import CellKeeper, Gaps, RunLengths, StepEstimator
+from triaxcal.poses.quality.finding import (
+    AXES,
+    Disturbance,
+    DisturbedPoses,
+    Finding,
+    MergedPoses,
+    MissingSamples,
+    Move,
+    StillIntervals,
+)
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.quantization import OTHERWISE, shown_step
-from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows, first_period_ns, window_size
+from triaxcal.poses.stillness.windows import (
+    OTHERWISE,
+    RATE_LEAST,
+    RATE_S,
+    RATE_SAMPLES,
+    Windows,
+    first_period_ns,
+    shown_step,
+    window_size,
+)
 
 CHUNK_LEAST = 4096
 """Samples that are judged at once, 256 blocks of noise: enough for their
@@ -138,3 +154,32 @@ class QualityDetector:
             return None
         first_s = (g.first_ns - self._begin_ns) * 1e-9
         return MissingSamples(g.missing, self.samples + g.missing, g.gaps, g.longest, first_s)
+
+
+# What the poses themselves are to be blamed for: shaking, and moves that it hid.
+
+
+def disturbances(poses: Sequence[Pose]) -> list[Finding]:
+    """Of the poses of one recording, in order of time: those that are shaken,
+    in a part or all through, and those that a move parts which shaking hid."""
+    found: list[Finding] = []
+    by_pose = [_of(p) for p in poses]
+    if all_of_them := tuple(itertools.chain.from_iterable(by_pose)):
+        disturbed = tuple(i for i, own in enumerate(by_pose) if own)
+        found.append(DisturbedPoses(all_of_them, disturbed, len(poses)))
+    if moves := tuple(_move(here, there) for here, there in itertools.pairwise(poses) if there.parted):
+        found.append(MergedPoses(moves))
+    return found
+
+
+def _of(pose: Pose) -> list[Disturbance]:
+    out = [Disturbance(pose.start_s, (s.start_s, s.end_s), s.times, s.scatter) for s in pose.shaken]
+    if pose.restless > 1:
+        out.append(Disturbance(pose.start_s, None, pose.restless, None))
+    return out
+
+
+def _move(here: Pose, there: Pose) -> Move:
+    apart = np.abs(there.mean - here.mean)
+    axis = int(np.argmax(apart))
+    return Move(here.end_s, there.start_s, AXES[axis], float(apart[axis]))

@@ -4,11 +4,13 @@ steps too coarse for the noise."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.poses.quality.extremes import COARSE, Cells
+from triaxcal.arrays import Bools, Floats, Ints, joined
 from triaxcal.poses.quality.finding import (
     AXES,
     AtRail,
@@ -22,8 +24,295 @@ from triaxcal.poses.quality.finding import (
     StillIntervals,
     StuckOutput,
 )
-from triaxcal.poses.quality.run_lengths import ROWS, EqualRun, RunLengths
-from triaxcal.poses.stillness.quantization import noise_of
+from triaxcal.poses.stillness.windows import noise_of
+
+# The extremes of every tenth of a second and how often they were read, and the step
+# of the output.
+
+LATTICE = 20.5
+"""Differences up to so many steps tell whether there are steps at all."""
+OFF_LATTICE = 0.05
+"""Steps by which a difference may miss a whole number of them; one in ten is as
+near by chance."""
+LATTICE_LEAST = 8
+"""Differences that have to lie on the lattice: by chance as many do once in ten
+million."""
+COARSE = 0.5
+"""Noise in steps, of a sample: with less, readings rest on one value for long."""
+HUSHED = 0.35
+"""The same for the quietest tenth of the blocks, which chance makes quieter
+than the rest."""
+BLOCK = 16
+"""Samples in a block. Longer ones hold noise and motion at once; of shorter
+ones chance decides which it is."""
+BLOCKS_LEAST = 4
+"""Blocks of noise in a chunk below which their quantiles say nothing."""
+NOISE_LIKE = 0.4
+"""Variance by fourth differences over that by second ones: 1 for white noise,
+next to 0 for smooth motion. Nearer to 1 sound noise is lost by chance."""
+NOISY_SHARE = 0.2
+"""Of all blocks: moves and stretches without noise may fill the others."""
+NOISELESS = 1e-13
+"""Scatter, as a share of the readings, that the arithmetic makes."""
+FINEST = 1e-10
+"""A step below this share of the readings is rounding of the arithmetic."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Stretches of equal length: ``start_ns``, ``end_ns`` (m,); ``high``,
+    ``low`` (m,3) extremes of the readings, ``at_high``, ``at_low`` (m,3) how
+    many samples read exactly that. ``size`` samples in each.
+    """
+
+    size: int
+    start_ns: Ints
+    end_ns: Ints
+    high: Floats
+    low: Floats
+    at_high: NDArray[np.integer[Any]]
+    at_low: NDArray[np.integer[Any]]
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+
+@dataclass
+class CellKeeper:
+    """Fed whole cells, in order."""
+
+    size: int
+    _done: list[tuple[Any, ...]] = field(default_factory=list)  # as Cells has them, behind its size
+
+    def feed(self, time_ns: Ints, u: Floats) -> None:
+        """``u`` (3,n), n a multiple of ``size``."""
+        blocks = u.reshape(3, -1, self.size)
+        times = time_ns.reshape(-1, self.size)
+        high, low = blocks.max(axis=2), blocks.min(axis=2)
+        small = np.min_scalar_type(self.size)  # there is one for each tenth of a second, however long
+        at_high = np.count_nonzero(blocks == high[:, :, None], axis=2).astype(small)
+        at_low = np.count_nonzero(blocks == low[:, :, None], axis=2).astype(small)
+        self._done.append((times[:, 0].copy(), times[:, -1].copy(), high.T, low.T, at_high.T, at_low.T))
+
+    def cells(self) -> Cells:
+        if not self._done:
+            none = np.zeros(0, dtype=np.int64)
+            empty = np.zeros((0, 3))
+            return Cells(self.size, none, none, empty, empty, empty.astype(np.int64), empty.astype(np.int64))
+        if len(self._done) > 1:
+            self._done = [joined(self._done)]
+        return Cells(self.size, *self._done[0])
+
+
+@dataclass
+class StepEstimator:
+    """Learns the smallest step of each axis, and its noise from sample to
+    sample, from chunks of the stream."""
+
+    _least: list[Floats] = field(default_factory=list)
+    _rough: list[list[float]] = field(default_factory=lambda: [[], [], []])
+    _least_rough: Floats = field(default_factory=lambda: np.full(3, np.inf))
+    _blocks: int = 0
+    _noisy: Ints = field(default_factory=lambda: np.zeros(3, dtype=np.int64))
+
+    def feed(self, u: Floats) -> None:
+        """``u`` (3,n) consecutive samples."""
+        if u.shape[1] < BLOCK + 4:
+            return
+        difference = np.diff(u, axis=1)
+        size = np.abs(difference)
+        largest = np.abs(u).max(axis=1)
+        self._least.append(np.array([_step(size[axis], FINEST * largest[axis]) for axis in range(3)]))
+        second, count = np.diff(difference, axis=1), (u.shape[1] - 4) // BLOCK
+        rough = _mean_square(second, count) / 6
+        # Noise is as large in fourth differences as in second ones; what moves
+        # smoothly all but vanishes there.
+        like_noise = (_mean_square(np.diff(second, n=2, axis=1), count) / 70 > NOISE_LIKE * rough) & (
+            rough > (NOISELESS * largest[:, None]) ** 2
+        )
+        self._blocks += rough.shape[1]
+        self._noisy += like_noise.sum(axis=1)
+        for axis in range(3):
+            noisy = rough[axis, like_noise[axis]]
+            if len(noisy) >= BLOCKS_LEAST:
+                low, middle = np.quantile(noisy, [0.1, 0.5])
+                self._rough[axis].append(float(middle))
+                self._least_rough[axis] = min(self._least_rough[axis], float(low))
+
+    def step(self) -> Floats:
+        """(3,) the smallest difference between readings, zero where they lie on
+        no lattice of steps that shows."""
+        if not self._least:
+            return np.zeros(3)
+        least = np.array(self._least)
+        found = np.where(least > 0, least, np.inf).min(axis=0)
+        return np.where(np.isfinite(found), found, 0.0)
+
+    def roughness(self) -> Floats:
+        """(3,) standard deviation of the noise of a sample, as far as it
+        differs from sample to sample; zero where most of the stream has none.
+        """
+        out = np.zeros(3)
+        for axis in np.flatnonzero(self._noisy > NOISY_SHARE * self._blocks).tolist():
+            out[axis] = np.sqrt(np.median(self._rough[axis])) if self._rough[axis] else 0.0
+        return out
+
+    def scatters(self, step: Floats) -> Bools:
+        """(3,) whether the noise is wider than half a ``step`` (3,), so that
+        readings rest on no value for long: as a rule, and not much less in any
+        part of the stream, as where a machine that shakes the stand is switched
+        off.
+        """
+        return np.asarray((self.roughness() > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
+
+
+def _mean_square(differences: Floats, count: int) -> Floats:
+    """(3,count) in blocks."""
+    blocks = differences[:, : count * BLOCK].reshape(3, count, BLOCK)
+    return np.asarray(np.einsum("ijk,ijk->ij", blocks, blocks) / BLOCK)
+
+
+def _step(size: Floats, floor: float) -> float:
+    changes = size[size > floor]
+    if not len(changes):
+        return 0.0
+    least = float(changes.min())
+    near = changes[changes < LATTICE * least] / least
+    if len(near) < LATTICE_LEAST or np.mean(np.abs(near - np.rint(near)) < OFF_LATTICE) < 0.999:
+        return 0.0
+    return least
+
+
+# Runs of equal readings: how long they are as a rule, and the longest ones.
+
+ROWS = 4
+"""The three axes, and all of them together."""
+LONGEST_COUNTED = 4096
+"""Lengths that are counted each by itself; longer runs count as this long, and
+are kept besides."""
+KEPT_LEAST = 8
+"""Samples in a run from which on it is kept by itself: shorter ones are common
+in sound noise. A frozen output of fewer samples is not told."""
+KEPT_MOST = 256
+"""Longest runs that are kept of each row, which bounds the memory; all others
+are counted."""
+RUNS_LEAST = 200
+"""Runs from which it is learned how long they are."""
+FALSE_ALARM = 1e-4
+"""Probability, in a stream, of a run by chance that is called a fault."""
+MARGIN = 1.5
+"""By which the tail may fall more slowly than was learned, from one run in a
+thousand."""
+SCALE_LEAST = 0.3
+"""Samples over which the tail falls by a factor of e, at least: as though one
+sample in 28 repeated, where fewer do. Errs on the side of calling nothing a
+fault."""
+
+
+@dataclass(frozen=True)
+class EqualRun:
+    """``samples`` equal readings in a row, from ``start_ns`` to ``end_ns``."""
+
+    start_ns: int
+    end_ns: int
+    samples: int
+    value: float
+
+
+@dataclass
+class RunLengths:
+    """Fed chunks of the stream in order; a run may go on from chunk to chunk."""
+
+    by_chance: float = 0.0
+    """How often all axes are expected to repeat at once."""
+    counts: Ints = field(default_factory=lambda: np.zeros((ROWS, LONGEST_COUNTED + 1), dtype=np.int64))
+    _long: list[list[EqualRun]] = field(default_factory=lambda: [[] for _ in range(ROWS)])
+    _fed: int = 0
+    _start: list[int] = field(default_factory=lambda: [0] * ROWS)
+    _start_ns: list[int] = field(default_factory=lambda: [0] * ROWS)
+    _last: Floats = field(default_factory=lambda: np.zeros(3))
+    _last_ns: int = 0
+
+    def feed(self, time_ns: Ints, u: Floats) -> None:
+        """``u`` (3,n)."""
+        n = len(time_ns)
+        changed = np.empty((ROWS, n), dtype=bool)
+        changed[:3, 0] = u[:, 0] != self._last if self._fed else False
+        np.not_equal(u[:, 1:], u[:, :-1], out=changed[:3, 1:])
+        changed[3] = changed[0] | changed[1] | changed[2]
+        if not self._fed:
+            self._start_ns = [int(time_ns[0])] * ROWS
+        for row in range(ROWS):
+            at = np.flatnonzero(changed[row])
+            if len(at):
+                self._close(row, at, time_ns, u)
+        self.by_chance += _by_chance(changed[:3])
+        self._fed += n
+        self._last, self._last_ns = u[:, -1].copy(), int(time_ns[-1])
+
+    def _close(self, row: int, at: Ints, time_ns: Ints, u: Floats) -> None:
+        """The runs that end before the changes at ``at``."""
+        length = np.diff(at, prepend=self._start[row] - self._fed)
+        self.counts[row] += np.bincount(np.minimum(length, LONGEST_COUNTED), minlength=LONGEST_COUNTED + 1)
+        for i in np.flatnonzero(length >= KEPT_LEAST):
+            before = int(at[i]) - 1
+            start_ns = self._start_ns[row] if i == 0 else int(time_ns[at[i - 1]])
+            end_ns = int(time_ns[before]) if before >= 0 else self._last_ns
+            value = float(u[row % 3, before] if before >= 0 else self._last[row % 3])
+            self._long[row].append(EqualRun(start_ns, end_ns, int(length[i]), value))
+        self._long[row] = _longest(self._long[row], 2 * KEPT_MOST)
+        self._start[row], self._start_ns[row] = self._fed + int(at[-1]), int(time_ns[at[-1]])
+
+    def runs(self, row: int) -> list[EqualRun]:
+        """The longest runs, by time, with the one that is not over yet."""
+        last = self._fed - self._start[row]
+        open_run = [EqualRun(self._start_ns[row], self._last_ns, last, float(self._last[row % 3]))] if last else []
+        return sorted(_longest(self._long[row], 0) + open_run, key=lambda r: r.start_ns)
+
+    def allowed(self, row: int) -> float:
+        """The longest run that the noise makes, by how the tail of the run
+        lengths falls; infinite where not known.
+
+        Runs of a scattering output end at any sample with some chance, so that
+        their tail is exponential at most. It is learned from how often samples
+        repeat, and where one run in a hundred and one in a thousand end, which
+        a frozen output does not shift.
+        """
+        counts = self.counts[row]
+        total = int(counts.sum())
+        if total < RUNS_LEAST:
+            return float("inf")
+        above = np.cumsum(counts)
+        high, higher = (int(np.searchsorted(above, q * total)) for q in (0.99, 0.999))
+        length = np.arange(1, higher + 1)
+        usual = counts[1 : higher + 1]
+        repeating = float(((length - 1) * usual).sum() / max((length * usual).sum(), 1))
+        scale = max(SCALE_LEAST, (higher - high) / np.log(10.0), -1 / np.log(max(repeating, 1e-300)))
+        return float(higher + MARGIN * scale * np.log(max(total / 1000, 1.0) / FALSE_ALARM))
+
+    def repeated(self, row: int, most: float) -> tuple[int, int]:
+        """Samples that repeat the one before, in runs of up to ``most``, and
+        all samples in such runs."""
+        upto = min(int(most), LONGEST_COUNTED - 1) + 1
+        length = np.arange(upto)
+        counts = self.counts[row, :upto]
+        return int(((length - 1) * counts)[1:].sum()), int((length * counts).sum())
+
+
+def _by_chance(changed: Bools) -> float:
+    """From ``changed`` (3,n): what the other combinations of axes that repeat
+    let expect, whatever any two axes have in common (the log-linear model
+    without the interaction of all three; Bishop, Fienberg and Holland 1975).
+    """
+    n = np.bincount((~changed).astype(np.int8).T @ np.array([1, 2, 4], dtype=np.int8), minlength=8).astype(float)
+    return float(n[0] * n[3] * n[5] * n[6] / np.maximum(n[[1, 2, 4]], 1.0).prod())
+
+
+def _longest(found: list[EqualRun], unless: int) -> list[EqualRun]:
+    if len(found) <= max(unless, KEPT_MOST):
+        return found
+    return sorted(found, key=lambda r: (-r.samples, r.start_ns))[:KEPT_MOST]
+
 
 RAIL_LEAST = 10
 """Readings at a rail beyond `RAIL_TIMES` those of other poses: poses of few are
@@ -232,3 +521,92 @@ def _rounding_error(variance: float) -> float:
     k, place = np.arange(1, 50)[:, None], np.linspace(0, 0.5, 101)
     waves = (-1.0) ** k / (np.pi * k) * np.sin(2 * np.pi * k * place) * np.exp(-2 * np.pi**2 * k**2 * noise**2)
     return min(float(np.abs(waves.sum(axis=0)).max()), 0.5)
+
+
+# Samples that are missing by the time stamps alone.
+
+OFF_CLOCK = 0.2
+"""Time stamps of an even clock: steps within this many periods of a whole
+number of them."""
+EVEN_SHARE = 0.95
+"""Of steps that are whole periods, from which on the clock is even: a few may
+be late."""
+EVEN_LEAST = 0.4
+"""Median step over the average period below which samples come in bursts: half
+of the steps lie within one then, and say nothing of the period."""
+BESIDE = 64
+"""Samples on each side of a gap whose earliest stamps are compared: more find a
+prompter one, but two gaps within them count as one."""
+SHIFT_LEAST = 0.75
+"""Of uneven time stamps, a gap is what shifts all that follow by so many
+periods."""
+LONG = 3.5
+"""Periods: of uneven stamps only steps above three are looked at, since late
+ones make others."""
+
+
+@dataclass
+class Gaps:
+    """Counts what is missing between samples. Fed chunks of the stream; judges
+    a step when what follows it is known."""
+
+    missing: int = 0
+    gaps: int = 0
+    longest: int = 0
+    first_ns: int = 0
+    _held: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    _judged: int = 0
+
+    def feed(self, time_ns: Ints, *, last: bool = False) -> None:
+        """``time_ns`` (n,) of the samples that follow; ``last``: no more come."""
+        held = np.concatenate([self._held, time_ns])
+        until = len(held) if last else len(held) - BESIDE
+        if len(held) >= 3 and until > self._judged:
+            self._judge(held, until)
+        keep = max(0, len(held) - 2 * BESIDE)
+        self._held, self._judged = held[keep:].copy(), max(until, self._judged) - keep
+
+    def _judge(self, time_ns: Ints, until: int) -> None:
+        step = np.diff(time_ns).astype(float)
+        lag = max(len(step) // 2, 1)  # over many bursts, if there are any
+        average, period = float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, float(np.median(step))
+        if period < EVEN_LEAST * average:  # they come in bursts
+            period = average
+        ratio = step / period
+        even = np.mean((np.abs(ratio - np.rint(ratio)) < OFF_CLOCK) & (ratio > 0.5)) >= EVEN_SHARE
+        lost = np.rint(ratio) - 1 if even else _shifts((time_ns - time_ns[0]) / average, ratio)
+        for i in range(self._judged, min(until, len(step))) if (lost >= 1).any() else ():
+            if lost[i] >= 1:
+                self._add(int(lost[i]), int(time_ns[i]))
+
+    def _add(self, lost: int, at_ns: int) -> None:
+        if not self.gaps:
+            self.first_ns = at_ns
+        self.gaps += 1
+        self.missing += lost
+        self.longest = max(self.longest, lost)
+
+
+def _shifts(periods: Floats, ratio: Floats) -> Floats:
+    """(n-1,) whole periods by which each long step shifts the clock for good:
+    samples that are only late catch up. ``periods`` (n,) are the times in
+    average periods.
+    """
+    late = periods - np.arange(len(periods))
+    lost = np.zeros(len(ratio))
+    # The average period is off by a burst in half of all samples.
+    least = SHIFT_LEAST + BESIDE * float(np.quantile(ratio, 0.99)) / max(len(ratio) // 2, 1)
+    clear = np.ones(len(ratio), dtype=bool)
+    long = np.flatnonzero(ratio > LONG)
+    for i in long[np.argsort(-ratio[long], kind="stable")]:
+        if not clear[i]:
+            continue
+        before, after = late[max(0, i - BESIDE) : i + 1], late[i + 1 : i + 1 + BESIDE]
+        if min(len(before), len(after)) >= BESIDE // 4:
+            # Delays only add: the earliest of each side is nearest to the
+            # truth.
+            shift = float(after.min() - before.min())
+            lost[i] = np.rint(shift) if shift > least else 0.0
+        if lost[i]:  # seen from the steps beside it too
+            clear[max(0, i - 2 * BESIDE) : i + 2 * BESIDE] = False
+    return lost

@@ -7,13 +7,13 @@ windows a move shows in the difference of neighbouring averages over one window
 and more, judged by how such differences scatter in this very stream, whatever
 the colour of its noise. What is left are runs, trimmed where a move sets out or
 settles, and put together where only a bump parts them. Where a machine shakes
-the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left.
-"""
+the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,13 +21,77 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.errors import TooShort
-from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrast, contrasts, unbroken
-from triaxcal.poses.stillness.quantization import Rounding, resolution
-from triaxcal.poses.stillness.shaken import ALONE_S, MOVE_SIGMA, runs, shaken_noise, shaken_runs
-from triaxcal.poses.stillness.shaken_parts import disturbances, parted, worth_keeping
-from triaxcal.poses.stillness.trimming import GUARD, SPAN_LEAST_WINDOWS, trimmed
-from triaxcal.poses.stillness.turns import without_turns
-from triaxcal.poses.stillness.windows import RATE_LEAST, WindowCutter, Windows, window_size
+from triaxcal.poses.stillness.noise_scales import (
+    GUARD,
+    SCALES,
+    SPAN_LEAST_WINDOWS,
+    NoiseScales,
+    contrast,
+    contrasts,
+    trimmed,
+    unbroken,
+)
+from triaxcal.poses.stillness.shaken import (
+    ALONE_S,
+    MOVE_SIGMA,
+    disturbances,
+    parted,
+    runs,
+    shaken_noise,
+    shaken_runs,
+    worth_keeping,
+)
+from triaxcal.poses.stillness.windows import RATE_LEAST, Rounding, WindowCutter, Windows, resolution, window_size
+
+# A unit that turns in place: what a turn about the vertical shows between the poses
+# about it.
+
+TURN_S = 1.0
+"""Turning a fixture by half a circle and putting it down takes as long; some
+knocks that ring do. What noise makes of the longest averages, which are over
+0.8 s, is shorter, but for rare chance."""
+IN_PLACE = 0.01
+"""Of the range of the outputs. Where poses cover the sphere this is 20 mrad:
+two orientations on a table that tilts by 10 mrad, or the pull 8 cm off the axis
+of half a turn in 2 s, on average."""
+PAUSE = 1 / 2
+"""What stands still on the way is shorter than this share of poses before and
+after it. A pose that is lost so costs its data; a piece of a turn that is taken
+for one puts its pull into the face."""
+
+
+def without_turns(w: Windows, quiet: list[Ints], shaken: list[Ints]) -> list[Ints]:
+    """Still pieces in order of time, but those that turns in place show between
+    quiet ones."""
+    known = {int(piece[0]) for piece in quiet}
+    pieces = sorted([*quiet, *shaken], key=lambda p: int(p[0]))
+    kept: list[Ints] = []
+    for place in _places(w, pieces):
+        at = [k for k, piece in enumerate(place) if int(piece[0]) in known]
+        hand = set(range(at[0], at[-1])).difference(at) if at else ()
+        kept += _without_pauses([piece for k, piece in enumerate(place) if k not in hand])
+    return kept
+
+
+def _places(w: Windows, pieces: list[Ints]) -> Iterator[list[Ints]]:
+    """Pieces that follow one another in place."""
+    if not pieces:
+        return
+    level: Floats = np.array([w.mean[piece].mean(axis=0) for piece in pieces])
+    apart = np.abs(np.diff(level, axis=0)).max(axis=1)
+    moved = np.flatnonzero(apart > IN_PLACE * np.ptp(level, axis=0).max()) + 1
+    for begin, end in itertools.pairwise([0, *moved.tolist(), len(pieces)]):
+        yield pieces[begin:end]
+
+
+def _without_pauses(place: list[Ints]) -> list[Ints]:
+    """Without those that have far longer ones before them and after them."""
+    length = np.array([len(piece) for piece in place])
+    before = np.maximum.accumulate(length)
+    after = np.maximum.accumulate(length[::-1])[::-1]
+    stays = length >= PAUSE * np.minimum(before, after)
+    return [piece for piece, kept in zip(place, stays, strict=True) if kept]
+
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
@@ -136,7 +200,7 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     have turned so, ``turn_s`` says how long a turn takes at least; a
     disturbance of that length parts spans then, whatever the means, and what
     stands out of it for a while is no span of its own
-    (`triaxcal.poses.stillness.turns`).
+    (`triaxcal.poses.stillness.detector`).
     """
     # Rounding of a digital output leaves windows without any scatter; a step of
     # it is noise all the same.

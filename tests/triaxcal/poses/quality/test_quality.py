@@ -12,7 +12,7 @@ from scipy import stats
 from benchmarks.noise import first_order, flicker, white
 from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.quality import Finding, QualityDetector, mains
-from triaxcal.poses.quality.faults import coarse_quantization
+from triaxcal.poses.quality.faults import Gaps, coarse_quantization
 from triaxcal.poses.quality.finding import (
     AtRail,
     CoarseQuantization,
@@ -26,7 +26,6 @@ from triaxcal.poses.quality.finding import (
     Touched,
 )
 from triaxcal.poses.quality.mains import bands
-from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import StillnessDetector
 
 NOISE = 3e-4

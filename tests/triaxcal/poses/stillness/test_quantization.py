@@ -14,7 +14,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import QualityDetector
-from triaxcal.poses.stillness.quantization import (
+from triaxcal.poses.stillness.windows import (
     mean_rounding_variance,
     noise_of,
     resolution,

@@ -11,7 +11,8 @@ from scipy.signal import butter, sosfilt
 
 from benchmarks.noise import first_order, white
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 
 Detect = Callable[..., tuple[Windows, list[Span], list[Pose]]]
 NOISE_G = 2e-4

@@ -17,7 +17,8 @@ from triaxcal.errors import InvalidData, TooShort
 from triaxcal.model.samples import Samples
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 from triaxcal.synthetic import SyntheticUnit, Tumble
 
 Detect = Callable[..., tuple[Windows, list[Span], list[Pose]]]

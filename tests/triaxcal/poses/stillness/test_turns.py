@@ -9,8 +9,8 @@ import pytest
 
 from tests.half_turns import HANDS, Stood, stood
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
-from triaxcal.poses.stillness.turns import TURN_S
+from triaxcal.poses.stillness.detector import TURN_S, Span, StillnessDetector
+from triaxcal.poses.stillness.windows import Windows
 
 TILTS = (0.0, 5e-5, 2e-4, 1e-3)
 

@@ -1,13 +1,16 @@
-"""The posterior of what acts in some poses: linearised anew, and with finer
-shapes, until neither changes it, or `ROUNDS` times."""
+"""The search for the likeliest sets of effects, and the refinement of their shapes."""
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from triaxcal.arrays import Floats
+from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
@@ -15,9 +18,8 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import State, linearise_all
 from triaxcal.estimate.recordings import by_run
+from triaxcal.evidence.likelihood import Evidence, SetEvidence
 from triaxcal.evidence.linearised_data import LinearisedData
-from triaxcal.evidence.marginal_likelihood import Evidence
-from triaxcal.evidence.model_search import likely_sets
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.row_covariance import inverse_of
@@ -26,6 +28,173 @@ from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
 from triaxcal.progress import Progress, Stage, untold
 from triaxcal.rounding import reaches
+
+# One unit's evidence with a further term, and without a name: what the pooled
+# analysis of several units multiplies.
+
+BASE_SETS = 3
+"""Sets of a unit, the likeliest, beside which an effect is asked about."""
+NEGLIGIBLE_LOG_RATIO = 14.0
+"""In the logarithm: parts that are less likely by more add nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseModel:
+    """A set that a further term may stand beside: ``found``, the ``names`` in
+    it, and ``with_each`` (T,R), the logarithm of its evidence with each term at
+    each size, of the sizes one by one."""
+
+    found: SetEvidence
+    names: frozenset[str]
+    with_each: Floats
+
+
+def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
+    """The likeliest sets, and what is left of the likeliest without some of its
+    terms, but for effects that are ``acting``; where none is, the empty set
+    too."""
+    evidence = unit.evidence
+    best = unit.sets[0].members
+    less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
+    some = [*less, *(found.members for found in unit.sets[:BASE_SETS])]
+    sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
+    known = {found.members: found for found in unit.sets}
+    # Whatever part is likely beside some set: an effect may take the place of a
+    # part.
+    likely = [
+        row
+        for row, part in enumerate(unit.sets[0].parts)
+        if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE_LOG_RATIO)
+    ]
+    out = []
+    for members in sets:
+        found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
+        rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE_LOG_RATIO).tolist()}
+        whole = log_sum_exp([evidence.with_each_further(found, row) for row in sorted(rows)], axis=0)
+        whole = whole + np.log(len(evidence.sizes))
+        out.append(BaseModel(found, unit.names_of(found), np.asarray(whole)))
+    return out
+
+
+def log_ratios(unit: Posterior, bases: Sequence[BaseModel], name: str) -> Floats:
+    """(T,R) the logarithm of the evidence of the unit with each term at each
+    size, over that of the unit by itself."""
+    others = [base for base in bases if name not in base.names]
+    with_each = log_sum_exp([base.with_each for base in others], axis=0)
+    without = log_sum_exp([base.found.total for base in others])
+    return np.asarray(with_each - without + log_ratio_without(unit, bases, name))
+
+
+def log_ratio_without(unit: Posterior, bases: Sequence[BaseModel], name: str) -> float:
+    """The logarithm of the evidence of the unit without that name, over that of
+    the unit by itself."""
+    every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
+    others = [found.total for found in every if name not in unit.names_of(found)]
+    return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
+
+
+# Which sets of terms are likely: single ones all, larger ones grown from the best
+# (Occam's window).
+
+SINGLES, LARGER = 0.3, 0.8
+"""Shares of the work, about, at which the sets of one term are reckoned, and
+all roughly."""
+Scores = dict[tuple[int, ...], float]
+LEADERS = (12, 6)
+"""Sets of one term that are grown, and of more: two by each choice of names,
+then one."""
+GROWN = 60
+"""Terms that are put beside one leader, the best."""
+MOST = 260
+"""Sets that are reckoned in full. More than so many within the window share
+what a few leave."""
+ROUGH = 4.0
+"""In the logarithm: by so much the score of a larger set may be off, as it is
+reckoned at the sizes and the parts that its smaller one likes best."""
+NO_PART = 1e-3
+"""A part with a smaller share in every leading set is left out of the sums."""
+
+
+def likely_sets(evidence: Evidence, told: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
+    """Those within the window, the best first; the empty one is among them.
+    ``told`` is called with about the share of the work that is done."""
+    singles = []
+    for part in range(len(evidence.parts)):
+        singles.append(evidence.log_evidence_with_each(part))
+        told(SINGLES * part / len(evidence.parts))
+    of_each = log_sum_exp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
+    level: Scores = {(i,): float(score) for i, score in enumerate(of_each)}
+    scores: Scores = {(): float(log_sum_exp([alone for _, alone in singles]))} | level
+    for depth in range(1, evidence.odds.together):
+        level = _grown(evidence, level, depth)
+        scores |= level
+        told(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
+    window = max(scores.values()) - np.log(evidence.odds.window)
+    ranked = sorted(scores, key=lambda members: -scores[members])
+    kept = [m for m in ranked if scores[m] > window - (ROUGH if len(m) > 1 else 0.0)][:MOST]
+    parts = _parts_that_matter(evidence, kept[: LEADERS[0]])
+    exact = [evidence.of_set(m, parts) for m in dict.fromkeys([*kept, ()])]
+    return sorted(exact, key=lambda found: -found.total)
+
+
+def _grown(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: int) -> Scores:
+    """Sets of one more term, each with its rough score."""
+    out: Scores = {}
+    for members in _leaders(evidence, level, depth):
+        scores = _scores_with_each_term(evidence, members)
+        for other in np.argsort(-scores)[:GROWN]:
+            if _go_together(evidence, members, int(other)):
+                grown = tuple(sorted((*members, int(other))))
+                out[grown] = max(out.get(grown, -np.inf), float(scores[other]))
+    return out
+
+
+def _leaders(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: int) -> Iterator[tuple[int, ...]]:
+    """The best of this size, within the window of the best of it."""
+    best = max(level.values(), default=0.0) - np.log(evidence.odds.window)
+    count_by_kinds: dict[tuple[str, ...], int] = {}
+    most, alike = (LEADERS[0], 2) if depth == 1 else (LEADERS[1], 1)
+    for members in sorted(level, key=lambda m: -level[m]):
+        if level[members] < best - ROUGH or sum(count_by_kinds.values()) == most:
+            return
+        kinds = tuple(sorted(evidence.terms[i].kind for i in members))
+        if count_by_kinds.get(kinds, 0) < alike:
+            count_by_kinds[kinds] = count_by_kinds.get(kinds, 0) + 1
+            yield members
+
+
+def _scores_with_each_term(evidence: Evidence, members: tuple[int, ...]) -> Floats:
+    """(T,) about the logarithm of the evidence of the members with each term,
+    with all priors: at the sizes that are best for the members, without an
+    unmodelled part and with the three that are likeliest beside the members."""
+    alone = evidence.of_set(members, range(len(evidence.parts)))
+    likely = np.argsort(-alone.by_part)[:3]
+    rows = dict.fromkeys([0, *map(int, likely)])
+    each = [log_sum_exp(evidence.with_each_further(alone, row), axis=1) for row in rows]
+    return np.asarray(log_sum_exp(each, axis=0) + evidence.log_prior)
+
+
+def _go_together(evidence: Evidence, members: tuple[int, ...], other: int) -> bool:
+    kind = evidence.terms[other].kind
+    return all(evidence.terms[i].kind != kind and not _nested(evidence.terms[i].kind, kind) for i in members)
+
+
+def _nested(one: str, other: str) -> bool:
+    """Whether one of the names has the columns of the other: temperature,
+    linear and quadratic."""
+    return {one, other} == {"temperature_bias", "temperature_bias_quadratic"}
+
+
+def _parts_that_matter(evidence: Evidence, leaders: list[tuple[int, ...]]) -> list[int]:
+    share = np.zeros(len(evidence.parts))
+    for members in leaders:
+        by_part = evidence.of_set(members, range(len(evidence.parts))).by_part
+        share = np.maximum(share, softmax(by_part))
+    return [part for part in range(len(share)) if part == 0 or share[part] > NO_PART]
+
+
+# The posterior of what acts in some poses: linearised anew, and with finer shapes,
+# until neither changes it, or `ROUNDS` times.
 
 ROUNDS = 4
 """Of linearising anew, each a step of Gauss and Newton, and of dividing shapes."""
