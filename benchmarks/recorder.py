@@ -25,8 +25,14 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.loading import BUILT_IN
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.inputs import bundle_of
-from triaxcald.recording.can_messages import batches_of, messages_of, row_of
-from triaxcald.recording.python_can import BATCH, RecordingMessageReader, RecordingMessageWriter
+from triaxcald.recording.python_can import (
+    BATCH,
+    RecordingMessageReader,
+    RecordingMessageWriter,
+    batches_of,
+    messages_of,
+    row_of,
+)
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.table import Table
-from triaxcald.recording.evidence import EvidenceIndex
 from triaxcald.recording.manifest import Manifest, Segment
+from triaxcald.recording.segments import EvidenceIndex
 
 UNITS, SEGMENTS = 1000, 168  # a week of hours
 OUTCOME_BYTES = 40_000  # of a run's document with its poses

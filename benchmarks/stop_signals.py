@@ -34,8 +34,7 @@ from triaxcald.errors import RecordingError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
-from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
-from triaxcald.simulation.unit import ReferenceUnit, UnitSilent
+from triaxcald.simulation.unit import CALIBRATION, ReferenceUnit, Stored, UnitSilent, factory_calibration
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ON_A_BUS = ("record", "provision", "run", "provision", "sim")

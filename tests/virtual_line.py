@@ -18,8 +18,7 @@ import pytest
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
-from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace, RegisterLink
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run import line, session, write_back
 from triaxcald.simulation.bench import load_device, simulate

@@ -23,7 +23,7 @@ from benchmarks.soak.bench import Bench
 from benchmarks.soak.faults import Fault, schedule
 from benchmarks.soak.recorder import Recorder
 from benchmarks.soak.verdict import verdict
-from triaxcald.cli.arguments import duration
+from triaxcald.cli.syntax import duration
 
 LOOK_S = 2.0
 BEGINS_IN_S = 60.0

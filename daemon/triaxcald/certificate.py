@@ -32,12 +32,12 @@ from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
-from triaxcald.choices import is_passing
-from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
+from triaxcald.doubts import is_passing
 from triaxcald.pipeline import Pipeline, of_poses
-from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
+from triaxcald.provision.registers import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
+from triaxcald.software import compute_with_one_thread
 from triaxcald.software import drawn_with as drawn_with
 from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.evidence.prior import Odds
-from triaxcald.errors import InputError
-from triaxcald.exit_codes import INTERRUPTED
+from triaxcald.errors import INTERRUPTED, InputError
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
 from triaxcald.run.line import Outcome, UnitRun, run_station

@@ -25,8 +25,7 @@ from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
 from triaxcal.uncertainty.next_recording import next_recording
 from triaxcal.units import ErrorUnit, in_units_of
-from triaxcald.choices import choices_of
-from triaxcald.doubts import UNIT
+from triaxcald.doubts import UNIT, choices_of
 
 NO_LONGER_OF_A_FINDING = ("p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g")
 NO_LONGER_OF_WHAT_IS_UNEXPLAINED = ("p_value", "or_spoiled", "or_named", "only_inside")

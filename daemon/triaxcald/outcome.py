@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.interchange.calibration_document import Document
-from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
+from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 

@@ -12,8 +12,8 @@ from triaxcal.number_format import micro_g, number_of
 from triaxcald.provision.state import DeviceState, Evidence, Held
 
 if TYPE_CHECKING:
-    from triaxcald.provision.plausible import Doubt
     from triaxcald.provision.procedure import Provisioning
+    from triaxcald.provision.registers import Doubt
 
 _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
     (DeviceState.UNTOUCHED, None): "no register was written",

@@ -19,8 +19,8 @@ from triaxcal.interchange.calibration_document import Document
 from triaxcal.number_format import plain
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import degrees, error, number, probability, uncertainty
-from triaxcald.computer import compute_with_one_thread
 from triaxcald.pipeline import Pipeline, of_poses
+from triaxcald.software import compute_with_one_thread
 from triaxcald.station.guidance import ups
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"

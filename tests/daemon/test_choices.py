@@ -14,7 +14,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcald.choices import choices_of
+from triaxcald.doubts import choices_of
 
 BENT: Mapping[str, Mapping[str, float]] = {"second_order_nonlinearity": {"x": 4e-4, "y": -4e-4, "z": 4e-4}}
 WARM = {"warm_up": {"x": 6e-4, "y": -6e-4, "z": 6e-4, "time_constant": 60.0}}

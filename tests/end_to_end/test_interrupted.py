@@ -17,7 +17,7 @@ from triaxcald.errors import RecordingError
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.reader import Recording
-from triaxcald.simulation.memory import Stored, factory_calibration
+from triaxcald.simulation.unit import Stored, factory_calibration
 
 ENDLESS = {"poses": 26, "hold_s": 1.0, "patience_s": 1e6}
 """More poses than the fixture of the simulated unit takes: such a run goes on for ever."""

@@ -28,8 +28,7 @@ from tests.end_to_end.servo_triad import (
     warm_reference,
 )
 from tests.virtual_line import virtual_line
-from triaxcald.simulation.memory import COVERED, CRC, TABLE, Stored, checksum
-from triaxcald.simulation.unit import ReferenceUnit
+from triaxcald.simulation.unit import COVERED, CRC, TABLE, ReferenceUnit, Stored, checksum
 
 SERIAL, RATE_HZ = 4711, 100.0
 BUS = {"host": "127.0.0.1", "port": 502}

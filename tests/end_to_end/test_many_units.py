@@ -15,8 +15,7 @@ from triaxcal_drivers.modbus.stack import serve_serial
 from triaxcald.audit import audit
 from triaxcald.run.line import Outcome, run_station
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
-from triaxcald.simulation.modbus_unit import ModbusMap
-from triaxcald.simulation.serial_pair import pty_pair
+from triaxcald.simulation.modbus_unit import ModbusMap, pty_pair
 from triaxcald.station.config import load_station
 from triaxcald.station.lines import check_lines
 

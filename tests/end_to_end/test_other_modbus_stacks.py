@@ -14,9 +14,8 @@ import pytest
 
 from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
 from triaxcald.simulation.modbus_unit import ModbusUnit
-from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import SteppedTimeBase
-from triaxcald.simulation.unit import ReferenceUnit
+from triaxcald.simulation.unit import ConstantPhysics, ReferenceUnit
 
 MBPOLL = shutil.which("mbpoll")
 if MBPOLL is None and os.environ.get("CI"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from triaxcald.inputs import measure
-from triaxcald.simulation.memory import Stored, factory_calibration
+from triaxcald.simulation.unit import Stored, factory_calibration
 
 UNIT = {
     "unit", "exit_code", "error", "wanted_poses", "data_quality", "serial", "recording", "certificate", "report",

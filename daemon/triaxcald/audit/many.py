@@ -10,8 +10,7 @@ from pathlib import Path
 from triaxcal.errors import TriaxcalError
 from triaxcal_drivers.errors import DriverError
 from triaxcald.audit.conduct import Audit, audit
-from triaxcald.errors import DaemonError, InputError
-from triaxcald.exit_codes import DONE, OUTSIDE, SEVEREST, exit_code_of
+from triaxcald.errors import DONE, OUTSIDE, SEVEREST, DaemonError, InputError, exit_code_of
 from triaxcald.memory import out_of_memory, ran_out_of_memory
 
 _WILD = frozenset("*?[")

@@ -14,23 +14,22 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
-from triaxcald.computer import compute_with_one_thread
 from triaxcald.decoded import DecodedStream
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
-from triaxcald.errors import DaemonError, RecordingError
-from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
+from triaxcald.errors import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED, DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import ATTACHMENT, Code, Ending, Papers, Verdict, measured_in, outcome_document
 from triaxcald.pipeline import Pipeline
-from triaxcald.provision.image import image_of
+from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
-from triaxcald.report.unit import unit_report
+from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.line import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
+from triaxcald.software import compute_with_one_thread
 from triaxcald.station.config import StationFile, parse_station
 from triaxcald.verification import (
     Apart,

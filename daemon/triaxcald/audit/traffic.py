@@ -12,12 +12,11 @@ from triaxcal_drivers.profile import Profile
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
-from triaxcald.provision import snapshot
+from triaxcald.provision import registers as snapshot
 from triaxcald.provision.identity import serial_text
-from triaxcald.provision.image import RegisterImage, calibration_registers
-from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
 from triaxcald.provision.proof import SEQUENCES, may_mark, own_steps, writes_of
+from triaxcald.provision.registers import RegisterImage, calibration_registers, doubts
 from triaxcald.provision.sequence import Label
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.schema import REGISTERS, RegisterAccess

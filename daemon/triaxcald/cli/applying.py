@@ -10,9 +10,9 @@ from pathlib import Path
 from triaxcal.documents import Calibration
 from triaxcal.number_format import number_of
 from triaxcald.applied import Applied, applied
-from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import say
 from triaxcald.cli.showing import reading_of, warn
+from triaxcald.cli.syntax import writable
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside
 from triaxcald.inputs import CALIBRATION, read_document

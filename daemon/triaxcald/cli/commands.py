@@ -11,8 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from triaxcal_drivers.nearest import closest
-from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
-from triaxcald.cli.syntax import register
+from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
 
 BAD_INPUT = 2
@@ -79,13 +78,13 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
         module, _, name = chosen.run.partition(":")
         command = getattr(import_module(f"triaxcald.cli.{module}"), name)
         if "scipy" in sys.modules:  # it may compute
-            from triaxcald.computer import compute_with_one_thread
+            from triaxcald.software import compute_with_one_thread
 
             compute_with_one_thread()
         if not gc.isenabled():  # as the program begins
             gc.freeze()
             gc.enable()
-        from triaxcald.cli.progress import telling_progress
+        from triaxcald.cli.console import telling_progress
 
         with telling_progress():
             code: int = command(chosen)

@@ -13,14 +13,30 @@ from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.loading import BUILT_IN, load_bundle
+from triaxcald import text
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.explain import explain
 from triaxcald.provision.identity import identified
-from triaxcald.provision.snapshot import take_snapshot
-from triaxcald.station.config import Place, load_station
+from triaxcald.provision.journal import open_journal
+from triaxcald.provision.registers import take_snapshot
+from triaxcald.station.config import Place, Station, load_station
+
+# What a command that writes nothing owes to whoever reads a device in between.
+
+
+def of_a_journal(station: Station, unit: str, serial: str | None) -> str | None:
+    """What there is to warn of, where an earlier provisioning of the unit is
+    not settled."""
+    journal = open_journal(station.folder, station.place(unit).bundle.profile, unit, serial)
+    return text.unfinished(journal, unit, station.path) if journal else None
+
+
+def warn_of_a_journal(station: Station, unit: str, serial: str | None) -> None:
+    """To standard error."""
+    if warning := of_a_journal(station, unit, serial):
+        say(f"warning: unit {unit}: {warning}")
 
 
 def registers_command(a: argparse.Namespace) -> int:

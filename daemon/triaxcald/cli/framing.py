@@ -24,11 +24,10 @@ from triaxcal.number_format import probability
 from triaxcal.poses.stillness.detector import TURN_S, find_spans
 from triaxcal.units import reference_unit_of
 from triaxcald import documents
-from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.showing import chosen, read_recording, telling_data_quality, warn
-from triaxcald.errors import InputError
-from triaxcald.exit_codes import DONE, OUTSIDE
+from triaxcald.cli.syntax import writable
+from triaxcald.errors import DONE, OUTSIDE, InputError
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
 from triaxcald.inputs import Measured, read_document, require_unit

@@ -22,8 +22,7 @@ from triaxcald import text
 from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
-from triaxcald.errors import InputError
-from triaxcald.exit_codes import severest
+from triaxcald.errors import InputError, severest
 from triaxcald.station.config import load_station
 from triaxcald.station.lines import check_lines
 
@@ -216,7 +215,7 @@ def _show_demo(u: DemoUnit) -> None:
 
 def sim_command(a: argparse.Namespace) -> int:
     from triaxcald.simulation.bench import load_device, simulate
-    from triaxcald.simulation.eeprom import read_eeprom
+    from triaxcald.simulation.unit import read_eeprom
 
     device = load_device(a.device)
     eeprom = a.device.parent / device.eeprom if device.eeprom else None
@@ -231,7 +230,7 @@ def sim_command(a: argparse.Namespace) -> int:
 
 
 async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
-    from triaxcald.simulation.eeprom import keep_eeprom
+    from triaxcald.simulation.unit import keep_eeprom
 
     async with simulated.serve() as server:
         name, device = simulated.bundle.profile.name, simulated.device

@@ -18,17 +18,16 @@ from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.certificate import held_by_device, image_of, why_not_written
-from triaxcald.choices import is_passing
 from triaxcald.cli.console import emit, say, show, showing, table
 from triaxcald.cli.interrupt import run_interruptible
+from triaxcald.doubts import is_passing
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
-from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.registers import RegisterImage
 from triaxcald.run.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
-from triaxcald.station.config import Place, load_station
-from triaxcald.station.today import days_since_1970
+from triaxcald.station.config import Place, days_since_1970, load_station
 
 
 def provision_command(a: argparse.Namespace) -> int:

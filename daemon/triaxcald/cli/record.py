@@ -5,37 +5,71 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gc
+import json
+import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO
 
 from triaxcal.number_format import number_of
 from triaxcald import text
-from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
+from triaxcald.cli.devices import of_a_journal, warn_of_a_journal
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
-from triaxcald.cli.json_lines import JsonLines
+from triaxcald.cli.syntax import writable
 from triaxcald.decoded import beside_samples
-from triaxcald.errors import InputError
-from triaxcald.exit_codes import DISK, INTERRUPTED, severest
+from triaxcald.errors import DISK, INTERRUPTED, InputError, severest
 from triaxcald.files import require_new, require_recording, unused
+from triaxcald.printable import printable_json
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
+from triaxcald.recording.schema import Phase
 from triaxcald.station.buses import BusPlace
-from triaxcald.station.changes import changed
-from triaxcald.station.config import Place, Station, load_station
+from triaxcald.station.config import Place, Station, changed, load_station
+from triaxcald.station.guidance import Guide
 from triaxcald.station.lines import check_lines
 
-if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
-    from triaxcald.run.recording import AtRecording, Kept
-    from triaxcald.run.roster import Roster
+if TYPE_CHECKING:
+    from triaxcald.run.recording import AtRecording, Kept, Roster
     from triaxcald.run.session import Segments, UnitSession
-    from triaxcald.station.serials import SerialsSeen
+    from triaxcald.station.config import SerialsSeen
+
+
+# Progress as one JSON object a line, for whoever collects logs.
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+class JsonLines:
+    """``time`` (UTC), ``level`` (``info``, ``warning``, ``error``), ``event``,
+    ``unit`` where it is of one, and what else there is to say, to standard
+    error by default."""
+
+    def __init__(self, out: TextIO | None = None, now: Callable[[], datetime] = _now) -> None:
+        self._out, self._now = out or sys.stderr, now
+
+    def stage(self, unit: str, text: str) -> None:
+        self.say("info", "stage", unit=unit, message=text)
+
+    def lost(self, unit: str, trouble: str) -> None:
+        self.say("warning", "lost", unit=unit, message=trouble)
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        self.say("info", "poses", unit=unit, phase=phase, found=guide.found, wanted=guide.wanted, message=guide.hint)
+
+    def say(self, level: str, event: str, **more: Any) -> None:
+        """Nowhere, where nobody reads any more: no work may fail for it."""
+        line = {"time": self._now().isoformat(timespec="milliseconds"), "level": level, "event": event, **more}
+        with suppress(OSError, ValueError):
+            self._out.write(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)) + "\n")
+            self._out.flush()
 
 
 AGAIN_S = 60.0
@@ -112,11 +146,10 @@ def _load(a: argparse.Namespace) -> _Chosen:
 async def _record(
     a: argparse.Namespace, chosen: _Chosen, progress: Bars | JsonLines, hangup: asyncio.Event
 ) -> list[Kept]:
-    from triaxcald.run.recording import State
-    from triaxcald.run.roster import Roster
+    from triaxcald.run.recording import Roster, State
     from triaxcald.service.supervisor import Supervisor
     from triaxcald.station.coming_back import Patience
-    from triaxcald.station.serials import SerialsSeen
+    from triaxcald.station.config import SerialsSeen
 
     roster = Roster(a.seconds, Patience(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress))
     serials = SerialsSeen()
@@ -129,7 +162,7 @@ async def _record(
 
     async with AsyncExitStack() as stack:
         if a.metrics is not None:
-            from triaxcald.service.metrics import served
+            from triaxcald.service.supervisor import served
 
             folder = a.output if a.folder else a.output.parent
             port = stack.enter_context(served(a.metrics, roster.statuses, folder))
@@ -220,8 +253,8 @@ def _of_units(
     progress: Bars | JsonLines,
     serials: SerialsSeen,
 ) -> list[AtRecording]:
+    from triaxcald.run.recording import UnitRecording
     from triaxcald.run.session import UnitSession
-    from triaxcald.run.unit_recording import UnitRecording
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
         if not a.folder:
@@ -244,7 +277,7 @@ def _of_units(
 def _of_buses(
     a: argparse.Namespace, station: Station, buses: Sequence[BusPlace], progress: Bars | JsonLines
 ) -> list[AtRecording]:
-    from triaxcald.run.bus_recording import BusRecording, bus_recording_name
+    from triaxcald.run.recording import BusRecording, bus_recording_name
 
     def path_of(bus: BusPlace) -> Path:
         if not a.folder:

@@ -20,7 +20,7 @@ from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 from triaxcald.cli.console import show, table
 from triaxcald.cli.showing import Choice, counted
-from triaxcald.remarks import assumption
+from triaxcald.doubts import assumption
 
 WIDTH = 80
 WORTH_A_LINE = 0.01

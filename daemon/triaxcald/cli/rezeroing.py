@@ -10,11 +10,11 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.text import bias_update
 from triaxcal.uncertainty import budget
-from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, show
 from triaxcald.cli.fitting import title_of, write_results
 from triaxcald.cli.results import show_budget, show_coefficients
 from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling_data_quality, warn
+from triaxcald.cli.syntax import writable
 from triaxcald.documents import rezero_document
 from triaxcald.earlier import EarlierFile
 

@@ -11,8 +11,7 @@ from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcal_drivers.extras import lacking
 from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
-from triaxcald.errors import DaemonError
-from triaxcald.exit_codes import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, exit_code_of, severest
+from triaxcald.errors import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, DaemonError, exit_code_of, severest
 from triaxcald.memory import out_of_memory, ran_out_of_memory
 
 

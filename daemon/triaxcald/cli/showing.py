@@ -17,8 +17,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error
 from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
-from triaxcald.cli.console import say, table
-from triaxcald.cli.progress import at
+from triaxcald.cli.console import at, say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, require_same_outputs
 from triaxcald.recording.series import is_recording

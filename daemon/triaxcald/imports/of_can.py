@@ -2,23 +2,173 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 from triaxcal.number_format import number_of
 from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.can.model import CanProfile
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import EXTENDED, Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.logs.times import LONGEST_NS
-from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports import text
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
-from triaxcald.imports.selection import Selection
 from triaxcald.imports.times import Ticks, Times
+
+# Which frames of a log are those of one unit: by the identifiers of its profile,
+# its node and its bus.
+
+_EXTENDED, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR)
+SHOWN = 8  # identifiers or channels in a message
+
+KEPT_APART = 4096
+"""Identifiers, and channels, that are counted each by itself: a bus has no more,
+and a file of random ones shall take no memory."""
+_OTHER_CHANNELS = "others"
+
+Key = tuple[int, int]
+"""An identifier, and `RawFlag.EXTENDED_ID` where it is one."""
+
+
+_FURTHER: Key = (0, -1)  # none that there is
+
+
+@dataclass
+class Selection:
+    """Takes the frames of one unit and counts the rest. ``node`` and
+    ``channel`` are what the user asked for; ``layouts`` are those of all
+    streams, ``readings`` among them."""
+
+    layouts: Mapping[str, Layout]
+    node: int | None = None
+    channel: str | None = None
+    frames: int = 0
+    taken: int = 0
+    error_frames: int = 0
+    elsewhere: int = 0  # of the unit's identifiers, on another channel or of another node
+    others: Counter[Key] = field(default_factory=Counter)
+    channels: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self._nodes: dict[Key, int | None] = {}  # by identifier; None where it does not shift
+        for layout in self.layouts.values():
+            for message in layout.messages:
+                self._nodes |= _identifiers(message)
+        self._readings = {key for m in self.layouts[READINGS].messages for key in _identifiers(m)}
+        counted = (m for layout in self.layouts.values() if layout.counters for m in layout.messages)
+        self._counted = {key for m in counted for key in _identifiers(m)}
+        self._seen: Counter[tuple[Key, str]] = Counter()
+        self._strangers: Counter[int] = Counter()  # frames of other nodes than the one asked for
+        self._of_unit: set[str] = set()  # channels
+
+    def takes(self, frame: LoggedFrame) -> bool:
+        self.frames += 1
+        name = frame.channel
+        self.channels[name if name in self.channels or len(self.channels) < KEPT_APART else _OTHER_CHANNELS] += 1
+        if self.channel is not None and frame.channel != self.channel:
+            self.elsewhere += 1
+            return False
+        if frame.flags & _ERROR:
+            if frame.channel not in self._of_unit:  # nobody knows yet whose bus that is
+                self.elsewhere += 1
+                return False
+            self.error_frames += 1
+            return True
+        key = frame.source, frame.flags & _EXTENDED
+        if key not in self._nodes:
+            self.others[key if key in self.others or len(self.others) < KEPT_APART else _FURTHER] += 1
+            return False
+        node = self._nodes[key]
+        if self.node is not None and node is not None and node != self.node:
+            self._strangers[node] += 1
+            self.elsewhere += 1
+            return False
+        self._seen[key, frame.channel] += 1
+        self._of_unit.add(frame.channel)
+        self.taken += 1
+        return True
+
+    def is_reading(self, frame: LoggedFrame) -> bool:
+        """Whether it is one of the messages that make a sample of the
+        readings."""
+        return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._readings
+
+    def is_counted(self, frame: LoggedFrame) -> bool:
+        """Whether it is a message of a stream with a counter."""
+        return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._counted
+
+    def settle(self, name: str) -> None:
+        """The node and the channels that the frames came by, once all have been
+        seen. Raises InputError where that is not one unit's, or none."""
+        if self.channel is not None and self.channel not in self.channels:
+            raise InputError(f"--channel {self.channel}: {name} has {_listed(self.channels)}")
+        if self.node is not None and not any(node is not None for node in self._nodes.values()):
+            raise InputError(f"--node {self.node}: the identifiers of the profile are the same for all nodes")
+        nodes = Counter(self._strangers)
+        for (key, _), count in self._seen.items():
+            if (node := self._nodes[key]) is not None:
+                nodes[node] += count
+        if self.node is not None and nodes and self.node not in nodes:
+            raise InputError(f"--node {self.node}: {name} has frames of {_listed(nodes)}")
+        if self.node is None and len(nodes) > 1:
+            raise InputError(f"{name}: frames of the nodes {_listed(nodes)}; --node says which is the unit's")
+        if self.node is None and nodes:
+            self.node = next(iter(nodes))
+        self._require_one_channel(name)
+        if not self.taken:
+            known = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER)
+            elsewhere = f"frames of other channels or nodes, or in error ({self.elsewhere})" if self.elsewhere else ""
+            there = ", ".join(filter(None, (known, elsewhere))) or "no frame"
+            wanted = ", ".join(self._wanted()[:SHOWN])
+            where = "in it" if self.channel is None else f"on its channel {self.channel}"
+            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is {where}; found: {there}")
+
+    def _require_one_channel(self, name: str) -> None:
+        places: dict[Key, Counter[str]] = {}
+        for (key, channel), count in self._seen.items():
+            places.setdefault(key, Counter())[channel] += count
+        for key, found in places.items():
+            if len(found) > 1:
+                shown = _identifiers_shown([key])
+                raise InputError(f"{name}: {shown} comes on {_listed(found)}; --channel says which is the unit's")
+
+    def _wanted(self) -> list[str]:
+        shown = []
+        for message in (m for layout in self.layouts.values() for m in layout.messages):
+            key = message.identifier_of(self.node or 0), _EXTENDED if message.extended else 0
+            shifts = message.per_node and self.node is None
+            shown.append(_identifiers_shown([key]) + (" + node" if shifts else ""))
+        return list(dict.fromkeys(shown))
+
+    @property
+    def from_channels(self) -> list[str]:
+        """Those that the unit's frames came on."""
+        return sorted({channel for _, channel in self._seen})
+
+
+def _identifiers(message: Message) -> dict[Key, int | None]:
+    flag = _EXTENDED if message.extended else 0
+    if not message.per_node:
+        return {(message.identifier, flag): None}
+    return {(message.identifier + node, flag): node for node in range(1, NODES + 1)}
+
+
+def _identifiers_shown(keys: Iterable[Key]) -> str:
+    shown = [f"0x{source:X}{'x' if extended else ''}" for source, extended in keys]
+    return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
+
+
+def _listed(counted: Mapping[Any, int]) -> str:
+    shown = [f"{clipped(what)} ({number_of(count, 'frame')})" for what, count in counted.items()]
+    return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
 
 
 def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:

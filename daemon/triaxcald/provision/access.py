@@ -3,6 +3,8 @@ device is waited for, all is recorded."""
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -13,7 +15,20 @@ from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSi
 from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
 from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.errors import DaemonError, TwoAnswer
-from triaxcald.provision.pace import REAL_PACE, Pace
+
+# How time passes while a device is written to, so that tests need not wait.
+
+
+@dataclass(frozen=True)
+class Pace:
+    """``sleep`` for so many seconds, ``clock_s`` monotonic."""
+
+    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
+    clock_s: Callable[[], float] = time.monotonic
+
+
+REAL_PACE = Pace()
+
 
 T = TypeVar("T")
 Kind = Literal["read", "write"]

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import Bundle, Profile
-from triaxcald.provision.image import checksum_of
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.registers import Snapshot, checksum_of
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
+from triaxcal.effects.contract import SINCE_START
+from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace
+from triaxcal.pictures import Inks, paint_trace
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
+from triaxcal.text import traces as words
 from triaxcal.units import ErrorUnit
-from triaxcald.report.figures import MICRO_G, clean, micro, micro_g, unit_label
-from triaxcald.report.ink import AXES, BAND, FLOOR, draw, hang_grid
+from triaxcald.report.document import CANDIDATE, Finding, Outcome, Pose
+from triaxcald.report.figures import MICRO_G, chance, clean, effect_title, micro, micro_g, number, unit_label
+from triaxcald.report.ink import AFTER, AXES, BAND, FLOOR, GRID, INK, MUTED, draw, hang_grid
+from triaxcald.report.meanings import run_of
 from triaxcald.report.over_time import stage_colours
 from triaxcald.report.stages import HoldOut, Stage
 from triaxcald.report.stream import StreamOverview
+from triaxcald.report.untrusted import mapping, texts
 
 Group = tuple[str, list[tuple[str, float]], float | None]
 _LONGEST_LABEL = 34
@@ -109,3 +124,325 @@ def _bar_group(
 
 def _times(ratio: float) -> str:
     return f"{ratio:.1f}" if ratio < 10 else f"{min(ratio, 1e9):.0f}"
+
+
+# The moments that effects of the model name, each by the clock of one recording,
+# and the poses about them.
+
+
+def moments_in(outcome: Outcome, recording: str) -> Mapping[str, float]:
+    """By name, in s by the clock of the recording; an empty name is the only
+    one's."""
+    return {
+        clean(effect_title(finding.effect)): at_s
+        for finding in outcome.findings
+        if (at_s := finding.shape("at")) is not None and finding.in_model and _recording(finding, outcome) == recording
+    }
+
+
+def bracket(finding: Finding, outcome: Outcome) -> str:
+    """In which pose or between which a moment lies, and how far it may be from
+    there; empty where there is none."""
+    at_s, recording = finding.shape("at"), _recording(finding, outcome)
+    timed = [
+        (pose, pose.start_s, pose.end_s)
+        for pose in outcome.poses
+        if pose.start_s is not None and pose.end_s is not None and pose.recording == recording
+    ]
+    if at_s is None:
+        return ""
+    where = f" of {recording}" if recording else ""
+    error_s = next((c.standard_error for c in finding.coefficients if c.name == "at"), None)
+
+    def reach(sure: bool) -> str:
+        if sure or error_s is None:
+            return ""
+        first, last = max(at_s - 2 * error_s, 0.0), min(at_s + 2 * error_s, max(end_s for _, _, end_s in timed))
+        return f"; two standard errors reach from {first:.1f} s to {last:.1f} s"
+
+    for pose, start_s, end_s in timed:
+        if start_s <= at_s <= end_s:
+            sure = error_s is None or (start_s <= at_s - 2 * error_s and at_s + 2 * error_s <= end_s)
+            return f"The moment lies {'' if sure else 'most likely '}in pose {pose.number}{where}{reach(sure)}."
+    before = [(end_s, pose.number) for pose, _, end_s in timed if end_s < at_s]
+    after = [(start_s, pose.number) for pose, start_s, _ in timed if start_s > at_s]
+    if not (before and after):
+        return ""
+    (end_s, first), (start_s, last) = max(before), min(after)
+    # Anywhere between the two is a rectangle; a tenth more, and it may have
+    # been inside them.
+    sure = error_s is None or error_s <= 1.1 * (start_s - end_s) / math.sqrt(12)
+    return (
+        f"The moment lies {'' if sure else 'most likely '}between pose {first} and pose {last}{where}, that is between "
+        f"{end_s:.1f} s and {start_s:.1f} s{reach(sure) or '; the poses tell it no nearer'}."
+    )
+
+
+def _recording(finding: Finding, outcome: Outcome) -> str:
+    """The one that its coefficients name; empty where they name none, or
+    several."""
+    runs = {run for c in finding.coefficients if (run := run_of(c.name)[1]) is not None}
+    run = runs.pop() if len(runs) == 1 else 0
+    return outcome.recordings[run - 1] if 0 < run <= len(outcome.recordings) else ""
+
+
+# The residual of every pose over the sphere of directions, one pair of hemispheres
+# a stage.
+
+# Readable on white and on near-black alike: saturated ends, a middle grey for
+# "no more than noise".
+_COLOURS = LinearSegmentedColormap.from_list(
+    "residual", ["#0a4fd0", "#3f86f0", "#8db4e8", "#a3a3a3", "#eab27e", "#f07f1e", "#c04a00"]
+)
+_MOST_DOUBLINGS = 7
+_EQUATOR = 0.02
+WIDTH_IN, HEIGHT_IN = 4.8, 3.4
+_MOST_NUMBERED = 40
+_LABEL_SIZE = (0.25, 0.14)
+"""Width and height of a index beside a pose, in radii of the sphere."""
+
+
+def sphere_pictures(
+    poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: ErrorUnit = MICRO_G
+) -> tuple[Markup, ...]:
+    """Poses on two equal-area hemispheres coloured by residual, a picture a
+    stage on one scale; none without directions or residuals."""
+    shown = [stage for stage in stages if stage.pose_residual_g is not None]
+    if not shown or all(pose.direction is None for pose in poses):
+        return ()
+    norm = _doubling_classes(shown, noise_floor_g)
+    return tuple(_of_stage(poses, stage, norm, unit, f"sphere{i or ''}") for i, stage in enumerate(shown))
+
+
+def _of_stage(poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm, unit: ErrorUnit, name: str) -> Markup:
+    def paint(figure: Figure) -> None:
+        pair = figure.subplots(1, 2, squeeze=False)
+        for axes, side in zip(pair[0], (1, -1), strict=True):
+            _hemisphere(axes, side, poses, stage, norm)
+            axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
+        pair[0, 0].set_title(stage.label, loc="left", weight="bold", pad=8)
+        _colour_bar(figure, pair, norm, 0.2 / HEIGHT_IN, unit)
+
+    alt = f"Residual over the sphere for {len(poses)} poses, {stage.label.lower()}"
+    return draw(name, alt, (WIDTH_IN, HEIGHT_IN), paint)
+
+
+def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Lambert's projection of unit vectors (n, 3) onto the unit disc (n, 2)
+    about +Z or −Z.
+
+    Both halves are seen from +Z, so +X lies right and +Y up in each.
+    """
+    height = np.clip(side * direction[:, 2], 0.0, 1.0)
+    across = np.linalg.norm(direction[:, :2], axis=1, keepdims=True)
+    return direction[:, :2] / np.where(across > 0, across, 1.0) * np.sqrt(1.0 - height)[:, None]
+
+
+def _doubling_classes(stages: Sequence[Stage], noise_floor_g: float | None) -> BoundaryNorm:
+    """Classes of ±1, ±2, ±4 … noise floors, so that errors before and after
+    both show on one scale."""
+    largest = max(float(np.nanmax(np.abs(r))) for stage in stages if (r := stage.pose_residual_g) is not None)
+    unit = noise_floor_g if noise_floor_g is not None and noise_floor_g > 0 else (largest / 8 or 1e-6)
+    doublings = int(np.clip(np.ceil(np.log2(max(largest / unit, 1.0))), 2, _MOST_DOUBLINGS))
+    edges = unit * 2.0 ** np.arange(doublings + 1)
+    return BoundaryNorm([*-edges[::-1], *edges], _COLOURS.N, extend="neither", clip=True)
+
+
+def _hemisphere(axes: Axes, side: int, poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm) -> None:
+    axes.set(xlim=(-1.42, 1.42), ylim=(-1.56, 1.36), aspect="equal")
+    axes.axis("off")
+    axes.add_patch(Circle((0, 0), 1, fill=False, ec=MUTED, lw=0.9))
+    for tilt_deg in (30, 60):
+        axes.add_patch(Circle((0, 0), float(np.sqrt(1 - np.cos(np.radians(tilt_deg)))), fill=False, ec=GRID, lw=0.6))
+    axes.plot([-1, 1], [0, 0], color=GRID, lw=0.6, zorder=0)
+    axes.plot([0, 0], [-1, 1], color=GRID, lw=0.6, zorder=0)
+    for label, x, y in (("+X", 1.27, -0.02), ("−X", -1.22, -0.02), ("+Y", 0, 1.24), ("−Y", 0, -1.18)):
+        axes.text(x, y, label, ha="center", va="center", color=MUTED, fontsize=8)
+    assert stage.pose_residual_g is not None
+    here = [
+        (pose, residual)
+        for pose, residual in zip(poses, stage.pose_residual_g, strict=True)
+        if pose.direction is not None and side * pose.direction[2] >= -_EQUATOR and np.isfinite(residual)
+    ]
+    if here:
+        _markers(axes, side, here, norm, numbered=len(poses) <= _MOST_NUMBERED)
+
+
+def _markers(axes: Axes, side: int, here: Sequence[tuple[Pose, float]], norm: BoundaryNorm, *, numbered: bool) -> None:
+    places = equal_area(np.array([pose.direction for pose, _ in here]), side)
+    used = np.array([pose.used for pose, _ in here])
+    residuals = np.array([residual for _, residual in here])
+    for mask, marker, edge in ((used, "o", INK), (~used, "X", INK)):
+        axes.scatter(
+            places[mask, 0], places[mask, 1], c=residuals[mask], cmap=_COLOURS, norm=norm, marker=marker,
+            s=52 if numbered else 18, edgecolors=edge, linewidths=0.6, clip_on=False, zorder=3,
+        )  # fmt: skip
+    if numbered:
+        for (x, y), numbers in _labels([pose.number for pose, _ in here], places):
+            # Clear of the axes' names, which stand above the rim and to the
+            # right of it.
+            up = -9.0 if y > 0.85 and abs(x) < 0.3 else 7.5 if x > 0.85 and abs(y) < 0.2 else 4.5
+            axes.annotate(numbers, (x, y), (4.5, up), textcoords="offset points", fontsize=6.5)
+
+
+def _labels(numbers: Sequence[int], places: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], str]]:
+    """One for all poses whose own would lie on each other, as of a pose that is
+    taken twice."""
+    groups: list[tuple[NDArray[np.float64], list[int]]] = []
+    for index, place in zip(numbers, places, strict=True):
+        near = next((g for at, g in groups if np.all(np.abs(place - at) < _LABEL_SIZE)), None)
+        if near is None:
+            groups.append((place, [index]))
+        else:
+            near.append(index)
+    return [(place, ", ".join(map(str, group))) for place, group in groups]
+
+
+def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float, unit: ErrorUnit) -> None:
+    bar = figure.colorbar(
+        ScalarMappable(norm, _COLOURS), ax=grid, orientation="horizontal", fraction=share, pad=0.02, aspect=37,
+        spacing="uniform",
+    )  # fmt: skip
+    bar.set_ticks(list(norm.boundaries), labels=[micro(edge, unit) for edge in norm.boundaries])
+    bar.ax.tick_params(labelsize=6, rotation=45)
+    bar.set_label(f"residual of the magnitude, {unit_label(unit)}")
+    bar.outline.set_edgecolor(MUTED)
+
+
+# The trace picture: what the poses show of each finding and each candidate, a panel
+# for each variable.
+
+PANEL_IN = (4.2, 2.9)
+"""Of a size that letters are legible on a telephone and in three columns."""
+INKS = Inks(used=FLOOR, excluded=MUTED, curve=AFTER, band=BAND, zero=MUTED)
+MOST = 12
+"""Panels of one document: three for each of four effects."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """``title`` says of what it is, ``caption`` what it shows."""
+
+    title: str
+    caption: str
+    drawing: Markup
+    partial: bool
+    """Whether it is of partial residuals."""
+
+
+def trace_panels(value: object, outcome: Outcome, unit: ErrorUnit = MICRO_G) -> tuple[Panel, ...]:
+    """Of the ``traces`` of a document; of one that has none the residuals in
+    standard errors, as far as these are known."""
+    known = list(read_traces(value))[:MOST] or list(_residuals(outcome.poses))
+    return tuple(_panel(trace, outcome, unit, f"trace{i}") for i, trace in enumerate(known))
+
+
+def read_traces(value: object) -> Iterator[Trace]:
+    """Those that can be drawn."""
+    for entry in value if isinstance(value, (list, tuple)) else []:
+        known = mapping(entry)
+        x, y, error = (_array(known.get(key)) for key in ("x", "y", "error"))
+        curve = mapping(known.get("curve"))
+        grid, fitted, half = (_array(curve.get(key)) for key in ("x", "y", "half_width"))
+        if known.get("quantity") not in list(Quantity) or not len(x) or not len(x) == len(y) == len(error):
+            continue
+        whole = len(grid) == len(fitted) == len(half) and bool(np.isfinite([grid, fitted, half]).all())
+        nothing = np.empty(0)
+        flags = known.get("excluded")
+        excluded = np.resize([bool(v) for v in flags] if isinstance(flags, list) and flags else [False], len(x))
+        sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(error)
+        if sound.any():
+            yield Trace(
+                effect=clean(known.get("effect") or ""),
+                axis=clean(known.get("axis") or "")[:1],
+                coefficients=tuple(map(clean, texts(known.get("coefficients")))),
+                variable=clean(known.get("variable") or POSE),
+                quantity=Quantity(str(known["quantity"])),
+                pose=np.flatnonzero(sound),
+                x=x[sound],
+                y=y[sound],
+                error=np.abs(error[sound]),
+                excluded=excluded[sound],
+                grid=grid if whole else nothing,
+                curve=fitted if whole else nothing,
+                half_width=half if whole else nothing,
+                share=number(known.get("share")),
+                p_value=number(known.get("p_value")),
+            )
+
+
+def _array(value: object) -> NDArray[np.float64]:
+    values = [number(v) for v in value] if isinstance(value, (list, tuple)) else []
+    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+
+
+def _residuals(poses: Sequence[Pose]) -> Iterator[Trace]:
+    known = [(p, p.residual_g / p.standard_error_g) for p in poses if p.residual_g is not None and p.standard_error_g]
+    if not known:
+        return
+    timed = all(p.middle_s is not None for p, _ in known) and len({p.recording for p, _ in known}) == 1
+    nothing = np.empty(0)
+    yield Trace(
+        effect="",
+        axis="",
+        coefficients=(),
+        variable=SINCE_START if timed else POSE,
+        quantity=Quantity.STANDARD_ERRORS,
+        pose=np.array([p.number - 1 for p, _ in known]),
+        x=np.array([p.middle_s if timed else p.number for p, _ in known], dtype=np.float64),
+        y=np.array([ratio for _, ratio in known]),
+        error=np.ones(len(known)),
+        excluded=np.array([not p.used for p, _ in known]),
+        grid=nothing,
+        curve=nothing,
+        half_width=nothing,
+    )
+
+
+def _panel(trace: Trace, outcome: Outcome, unit: ErrorUnit, name: str) -> Panel:
+    def paint(figure: Figure) -> None:
+        axes = figure.subplots()
+        paint_trace(axes, trace, unit, INKS)
+        hang_grid(axes)
+
+    drawing = draw(name, words.description(trace, unit), PANEL_IN, paint)
+    partial = trace.quantity is not Quantity.STANDARD_ERRORS
+    return Panel(words.title(trace), _caption(trace, outcome), drawing, partial)
+
+
+def _caption(trace: Trace, outcome: Outcome) -> str:
+    """How sure it is that this acts, or what the picture says."""
+    if trace.quantity is Quantity.STANDARD_ERRORS:
+        return _of_residuals(outcome)
+    if trace.share is not None:
+        return _of_curve(trace.share, trace.p_value)
+    if trace.effect == words.SMOOTH:
+        return "The mean over all that may act, as a function of the direction"
+    finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
+    if finding is None:
+        return f"Probability {chance(outcome.averaged.get(trace.effect))}, and corrected by as much"
+    return _of_finding(finding)
+
+
+def _of_curve(share: float, p_value: float | None) -> str:
+    said = f"Smooth curves on three axes take away {100 * max(share, 0.0):.0f} % (adjusted)"
+    if p_value is None:
+        return said
+    if p_value > SIGNIFICANT:
+        return f"{said}, no more than chance does for one of these variables (p {p_value:.2g})"
+    return f"{said}; chance does as much with p {p_value:.1g}"
+
+
+def _of_finding(finding: Finding) -> str:
+    sure = "Probable" if finding.probability is None else f"Probability {chance(finding.probability)}"
+    if finding.alternatives:
+        return f"{sure}; or instead {', '.join(effect_title(n).lower() for n in finding.alternatives[:3])}"
+    return sure + (", not certain" if finding.verdict == CANDIDATE else "")
+
+
+def _of_residuals(outcome: Outcome) -> str:
+    nothing = outcome.nothing_probability
+    if outcome.searched and not outcome.findings and not outcome.something_is_left:
+        likely = "" if nothing is None else f" (probability {chance(nothing)} that nothing acts)"
+        return f"Nothing is left beyond noise{likely}"
+    return "What is left, in standard errors of the poses"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from triaxcal.effects.runs import BETWEEN_RUNS
-from triaxcald.choices import HOST, PROCESS, REGISTERS
+from triaxcald.doubts import HOST, PROCESS, REGISTERS
 from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.figures import effect_title
 from triaxcald.report.registers import Device, passes

@@ -2,13 +2,14 @@
 without trust.
 
 Nothing in a document is required: a report on a refused or damaged result must
-still come out, with a dash where a value is missing.
-"""
+still come out, with a dash where a value is missing."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import PurePath
 
 import numpy as np
 
@@ -18,9 +19,38 @@ from triaxcal.interchange.calibration_document import WEIGHT
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
-from triaxcald.report.recordings import OfRecording, by_recording, file_names
 from triaxcald.report.stages import HoldOut, Residual, Stage, held_out_of, stages_of
 from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
+
+# The recordings of a document that was made from several.
+
+
+@dataclass(frozen=True)
+class OfRecording:
+    """How well the magnitude comes out in the poses of one recording, rms in
+    the unit of the reference."""
+
+    name: str
+    poses: float | None
+    before_rms_g: float | None
+    after_rms_g: float | None
+    noise_floor_g: float | None
+
+
+def file_names(paths: Sequence[str]) -> dict[str, str]:
+    """What to call recordings, by path: by their files' names where these tell
+    them apart."""
+    names = [PurePath(path).name or path for path in paths]
+    counts = Counter(names)
+    return {path: clean(name if counts[name] == 1 else path) for path, name in zip(paths, names, strict=True)}
+
+
+def by_recording(value: object, names: Mapping[str, str]) -> Iterator[OfRecording]:
+    for known in map(mapping, value if isinstance(value, (list, tuple)) else ()):
+        name = names.get(str(known.get("recording")), "")
+        keys = ("poses", "before_rms_g", "after_rms_g", "noise_floor_g")
+        yield OfRecording(name, *(number(known.get(key)) for key in keys))
+
 
 _OF_A_POSE = (
     "start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage", "standard_error_g",

@@ -2,30 +2,134 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from triaxcal.text.traces import SMOOTH
-from triaxcald.remarks import assumption
+from triaxcald import text
+from triaxcald.certificate import Certified
+from triaxcald.doubts import assumption
+from triaxcald.outcome import Ending
+from triaxcald.pipeline import Pipeline
+from triaxcald.provision.state import Held
 from triaxcald.report import figures
 from triaxcald.report.before_after import before_after
-from triaxcald.report.budget import read_uncertainty
-from triaxcald.report.charts import bars_picture, stream_pictures
+from triaxcald.report.charts import bars_picture, bracket, moments_in, sphere_pictures, stream_pictures, trace_panels
 from triaxcald.report.choices import choices_in, who_corrects
 from triaxcald.report.document import read_document
 from triaxcald.report.faults import faults_of, left_out
+from triaxcald.report.figures import number
 from triaxcald.report.meanings import factor, in_plain, told
-from triaxcald.report.moments import bracket, moments_in
 from triaxcald.report.over_time import time_pictures
 from triaxcald.report.registers import read_device
-from triaxcald.report.sphere import sphere_pictures
-from triaxcald.report.stream import StreamOverview
-from triaxcald.report.traces import trace_panels
-from triaxcald.report.untrusted import mapping
+from triaxcald.report.stream import StreamOverview, overview_of
+from triaxcald.report.untrusted import mapping, numbers, texts, vector
 from triaxcald.report.verdict import final_word, judge
+
+# The uncertainty budget of a calibration document, read without trust like the rest
+# of it.
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """``magnitude_g`` is a standard uncertainty of |a|; ``share`` of its
+    variance, 0…1."""
+
+    source: str
+    evaluation: str
+    magnitude_g: float | None
+    share: float | None
+    how: str
+    assumes: tuple[str, ...] = ()
+
+    @property
+    def percent(self) -> str:
+        if self.share is None:
+            return ""
+        return "< 1 %" if 0 < self.share < 0.01 else f"{self.share:.0%}".replace("%", " %")
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    lines: tuple[BudgetLine, ...]
+    standard_g: float | None
+    coverage_factor: float | None
+    expanded_g: float | None
+    level_percent: float | None
+    expanded: Mapping[str, float | None]
+    dominant: str
+    halved_by: str
+    if_halved_g: float | None
+    not_evaluated: tuple[str, ...]
+    scopes: tuple[tuple[str, str, float | None], ...] = ()
+    """Name, meaning, and expanded uncertainty of |a| in g."""
+
+
+SCOPES = {
+    "this_fit": ("This fit", "the calibration by itself, at the reference conditions"),
+    "this_sessions_poses": ("This session’s poses", "one more pose of this recording, with its noise"),
+    "another_day": ("Another day", "the next recording, with how the unit starts"),
+}
+
+
+def read_uncertainty(calibration: Mapping[str, object]) -> Uncertainty | None:
+    """None where the document has no budget."""
+    known = mapping(calibration.get("uncertainty"))
+    entries = known.get("budget")
+    if not isinstance(entries, (list, tuple)) or not entries:
+        return None
+    whole, level = mapping(known.get("magnitude")), number(known.get("level"))
+    return Uncertainty(
+        lines=tuple(_line(mapping(entry)) for entry in entries),
+        standard_g=number(whole.get("standard_g")),
+        coverage_factor=number(whole.get("coverage_factor")),
+        expanded_g=number(whole.get("expanded_g")),
+        level_percent=None if level is None else 100 * level,
+        expanded=dict(_expanded(mapping(known.get("expanded")))),
+        dominant=_words(known.get("dominant")),
+        halved_by=str(known.get("halved_by") or ""),
+        if_halved_g=number(known.get("magnitude_if_halved_g")),
+        not_evaluated=texts(known.get("not_evaluated")),
+        scopes=tuple(_scopes(mapping(calibration.get("expanded_uncertainty_g")))),
+    )
+
+
+def _scopes(known: Mapping[str, object]) -> Iterator[tuple[str, str, float | None]]:
+    for key, (name, meaning) in SCOPES.items():
+        if key in known:
+            yield name, meaning, number(known[key])
+
+
+def _line(entry: Mapping[str, object]) -> BudgetLine:
+    return BudgetLine(
+        _words(entry.get("source")),
+        str(entry.get("evaluation") or ""),
+        number(entry.get("magnitude_g")),
+        number(entry.get("share")),
+        str(entry.get("how") or ""),
+        texts(entry.get("assumes")),
+    )
+
+
+def _expanded(known: Mapping[str, object]) -> Iterator[tuple[str, float | None]]:
+    """Of every coefficient, by a name like `bias.x` or `warm_up.x`."""
+    for group in ("scale_factor", "misalignment", "bias"):
+        for axis, value in zip("xyz", vector(known.get(group)) or (None, None, None), strict=True):
+            yield f"{group}.{axis}", value
+    for effect, values in mapping(known.get("effects")).items():
+        for name, value in numbers(values).items():
+            yield f"{effect}.{name}", value
+
+
+def _words(name: object) -> str:
+    return str(name or "").replace("_", " ")
+
 
 # Parts of a certificate that the page shows elsewhere, or that are too long to
 # read.
@@ -126,3 +230,33 @@ def _environment() -> Environment:
 
 
 _ENVIRONMENT = _environment()
+
+
+# The report on one unit of a station, from values that its recording holds: line
+# and audit draw it alike.
+
+_DRAWING = threading.Lock()
+"""The pictures' style is the process's own: one report is drawn at a time."""
+
+
+def unit_report(
+    certified: Certified, pipeline: Pipeline, ending: Ending, verification: Mapping[str, Any] | None, held: Held
+) -> str:
+    """``pipeline`` is that of the readings, finished. The same values give the
+    same bytes."""
+    papers: dict[str, object] = dict(certified.document)
+    papers["outcome"] = {"verdict": ending.verdict.value, "reason": ending.reason}
+    if verification:
+        papers["verification"] = verification
+    if certified.image is not None:
+        papers["device"] = text.held(held)
+    profile = pipeline.bundle.profile
+    overview = overview_of(pipeline.windows, pipeline.poses(), profile.output.unit)
+    unit = certified.document["unit"]
+    with _DRAWING:
+        return render_report(
+            certified.document["result"],
+            title=f"{unit['product']} {unit['serial'] or 'of unknown serial number'}",
+            stream=overview,
+            certificate=papers,
+        )

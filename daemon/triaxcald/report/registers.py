@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from triaxcal.effects import effect_named
 from triaxcal.effects.runs import BETWEEN_RUNS
-from triaxcald.choices import is_passing
+from triaxcald.doubts import is_passing
 from triaxcald.report.figures import number
 from triaxcald.report.untrusted import mapping, texts
 

@@ -10,8 +10,7 @@ from typing import Literal
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.text.traces import SMOOTH
 from triaxcal.units import ErrorUnit
-from triaxcald.doubts import doubts_of
-from triaxcald.remarks import none_could_show
+from triaxcald.doubts import doubts_of, none_could_show
 from triaxcald.report.document import CANDIDATE, Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import chance, effect_title, micro_g, ratio

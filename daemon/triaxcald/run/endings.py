@@ -11,9 +11,13 @@ from typing import Any
 
 from triaxcal.interchange.calibration_document import Document
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, SecondAnswer
-from triaxcald import exit_codes, text
+from triaxcald import errors as exit_codes
+from triaxcald import text
 from triaxcald.certificate import exceeded
 from triaxcald.errors import (
+    DEVICE,
+    DISK,
+    INTERRUPTED,
     DeviceInUse,
     DiskError,
     Implausible,
@@ -21,14 +25,14 @@ from triaxcald.errors import (
     SerialTwice,
     StationError,
     TwoAnswer,
+    exit_code_of,
 )
-from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.outcome import Code, Ending, Verdict
 from triaxcald.printable import printable_lines
-from triaxcald.provision.correction import ReadingsNotStated
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.registers import ReadingsNotStated
 from triaxcald.provision.state import DeviceState
 from triaxcald.run.reasons import is_internal
 from triaxcald.run.reasons import reason_of as reason_of

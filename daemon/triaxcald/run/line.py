@@ -25,8 +25,7 @@ from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
-from triaxcald.errors import InputError, RecordingError
-from triaxcald.exit_codes import DISK, REFUSED
+from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
 from triaxcald.files import write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
@@ -43,14 +42,13 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.pipeline import Pipeline
-from triaxcald.provision.correction import leaves_open, require_readings_before
 from triaxcald.provision.identity import IdentityRead
-from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.journal import Owner, journals_of, open_journal
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.registers import RegisterImage, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.report.unit import unit_report
+from triaxcald.report.page import unit_report
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.session import UnitSession
 from triaxcald.run.together import side_by_side
@@ -58,9 +56,8 @@ from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.software import software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.coming_back import AtWork, Patience, Streaming
-from triaxcald.station.config import Place, Station
-from triaxcald.station.confirmation import Confirmation
-from triaxcald.station.serials import SerialsSeen
+from triaxcald.station.config import Place, SerialsSeen, Station
+from triaxcald.station.output_check import Confirmation
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"

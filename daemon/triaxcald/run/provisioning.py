@@ -18,8 +18,7 @@ from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
 from triaxcald.documents import to_text
-from triaxcald.errors import Implausible, InputError, RecordingError
-from triaxcald.exit_codes import BAD_INPUT
+from triaxcald.errors import BAD_INPUT, Implausible, InputError, RecordingError
 from triaxcald.files import write_new
 from triaxcald.outcome import (
     SUFFIX,
@@ -31,14 +30,10 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.correction import leaves_open, require_readings_before
-from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import open_journal, parse, registers_of
-from triaxcald.provision.plausible import Doubt
+from triaxcald.provision.journal import journaled_image, open_journal, parse, registers_of
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, image_of, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
-from triaxcald.provision.unfinished import journaled_image
 from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER

@@ -4,28 +4,38 @@ likes; they may be lost meanwhile, and come back."""
 from __future__ import annotations
 
 import asyncio
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from triaxcal_drivers.claim import Claim
+from triaxcal_drivers.interface import Device
+from triaxcal_drivers.profile import READINGS
 from triaxcald import text
-from triaxcald.errors import RecordingError
-from triaxcald.exit_codes import DEVICE, DONE, exit_code_of
-from triaxcald.provision.identity import WrongUnit
+from triaxcald.errors import DEVICE, DONE, RecordingError, exit_code_of
+from triaxcald.provision.identity import IdentityRead, WrongUnit
+from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.ending import Kind, ended_because
-from triaxcald.recording.schema import RAW
+from triaxcald.recording.schema import BUS_RECORD, CALIBRATION, RAW, STATION_FILE
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
 from triaxcald.run.reasons import reason_of, trace_of
+from triaxcald.run.session import Segments, UnitSession, new_writer, stamp
 from triaxcald.run.together import while_sound, whole_on_a_thread
-from triaxcald.station.collection import Progress
+from triaxcald.software import versions
+from triaxcald.station.buses import BusPlace
+from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.coming_back import Patience
+from triaxcald.station.config import Station
+from triaxcald.station.listening import Listened, ReturningBus
 from triaxcald.station.lock import locked
 from triaxcald.station.raw_records import RawRecords
+from triaxcald.text import NOTHING_YET
 
 
 @dataclass(frozen=True)
@@ -241,3 +251,246 @@ class AtRecording(ABC):
 
     def _asked(self, e: BaseException) -> bool:
         return self._leaves and isinstance(e, asyncio.CancelledError)
+
+
+# Which recordings a process makes side by side; that may change meanwhile.
+
+
+class Roster:
+    """Each records for so many ``seconds``, for ever where None, or until it is
+    given up; one that ends does not stop the others, and ``ended`` is told of
+    it."""
+
+    def __init__(
+        self, seconds: float | None, patience: Patience, ended: Callable[[Kept], None] = lambda _: None
+    ) -> None:
+        self._seconds, self._patience, self._ended = seconds, patience, ended
+        self._work: dict[str, tuple[AtRecording, asyncio.Task[Kept]]] = {}
+        self._changes = 0
+        self._changed = asyncio.Event()
+        self._stopped = False
+
+    def statuses(self) -> list[UnitStatus]:
+        """Of the last recording of each name that is on it. From any thread."""
+        return [one.status for one, _ in tuple(self._work.values())]
+
+    def at_work(self) -> set[str]:
+        return {name for name, (_, task) in self._work.items() if not task.done()}
+
+    def ended_with(self, code: int) -> set[str]:
+        """Those whose last recording ended with that exit code."""
+        return {
+            name
+            for name, (_, task) in self._work.items()
+            if task.done() and not task.cancelled() and task.result().exit_code == code
+        }
+
+    def begin(self, recordings: Iterable[AtRecording]) -> None:
+        """None of a name that is at work; nothing, once all are to end."""
+        if self._stopped:
+            return
+        for one in recordings:
+            self._work[one.name] = one, asyncio.ensure_future(self._record(one))
+        self._changed.set()
+
+    async def change(self, leaving: Collection[str], beginning: Iterable[AtRecording]) -> None:
+        """Those of the names ``leaving`` end as if asked to, and are on it no
+        more; then the others begin, unless all are to end by then."""
+        self._changes += 1
+        try:
+            going = [self._work[name] for name in leaving if name in self._work]
+            for one, task in going:
+                one.leave()
+                task.cancel()
+            if going:
+                await asyncio.wait([task for _, task in going])
+            for one, _ in going:
+                del self._work[one.name]
+            if not self._stopped:
+                self.begin(beginning)
+        finally:
+            self._changes -= 1
+            self._changed.set()
+
+    async def finish(self) -> list[Kept]:
+        """What those on it have come to, once none is at work. When this is
+        cancelled every one of them is, again each time, and waited for; what
+        was recorded is whole."""
+        while True:
+            pending = [task for _, task in self._work.values() if not task.done()]
+            if not pending and not self._changes:
+                # One that was cancelled before its first step has come to nothing.
+                return [task.result() for _, task in self._work.values() if not task.cancelled()]
+            self._changed.clear()
+            changed = asyncio.ensure_future(self._changed.wait())
+            try:
+                await asyncio.wait([*pending, changed], return_when=asyncio.FIRST_COMPLETED)
+            except asyncio.CancelledError:
+                self._stopped = True
+                for _, task in tuple(self._work.values()):  # a change may have begun some since
+                    task.cancel()
+            finally:
+                changed.cancel()
+
+    async def _record(self, one: AtRecording) -> Kept:
+        kept = await one.run(self._seconds, self._patience)
+        self._ended(kept)
+        return kept
+
+
+# A bus that is recorded: all its frames, for later, of no unit.
+
+
+class BusRecording(AtRecording):
+    """The recording of one bus, at what ``path_of`` gives once it is open, in
+    ``segments`` where they are given. ``progress`` shows the operator how it
+    goes, ``clock_ns`` is the host's time since the epoch."""
+
+    kind = "bus"
+
+    def __init__(
+        self,
+        station: Station,
+        place: BusPlace,
+        progress: Progress,
+        path_of: Callable[[], Path],
+        segments: Segments | None = None,
+        *,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        listened = Listened(phase_of(place.settings.channel))
+        super().__init__(place.name, listened, progress)
+        self._station, self._place = station, place
+        self._path_of, self._segments, self._clock_ns = path_of, segments, clock_ns
+        self._listened = listened
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return self._listened.counts
+
+    @property
+    def _seconds(self) -> float:
+        return self._listened.seconds
+
+    async def _work(self, seconds: float | None, patience: Patience) -> None:
+        is_lost = partial(self._is_lost, patience)
+        async with self._place.opened(patience, lambda trouble: is_lost(str(trouble))) as listener:
+            self._path = self._path_of()
+
+            async def record(writer: RecordingWriter) -> None:
+                self._progress.stage(self.name, "recording")
+                await self._listened.for_seconds(ReturningBus(listener, patience, is_lost), writer, seconds)
+
+            make = partial(self._new_writer, self._path)
+            await self._recorded_by(make, record, self._path if self._segments else None)
+
+    def _is_lost(self, patience: Patience, trouble: str | None) -> None:
+        self._state = State.RECORDING if trouble is None else State.WAITING
+        self._trouble = trouble
+        if trouble is None:
+            self._progress.stage(self.name, text.BUS_IS_BACK)
+        else:
+            self._progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
+
+    def _new_writer(self, path: Path) -> RecordingWriter:
+        """With the station file in it. Raises RecordingError."""
+        bus = self._place.settings
+        told = {"name": self._place.name, "bitrate": "" if bus.bitrate is None else str(bus.bitrate)}
+        settings: dict[str, Any] = {
+            "metadata": {
+                "station": {"name": self._station.file.name},
+                BUS_RECORD: bus_record(bus.interface, bus.channel, **told),
+                "software": versions(),
+            },
+            "preview_channels": None,
+            "clock_ns": self._clock_ns,
+        }
+        writer = new_writer(path, self._segments, **settings)
+        writer.attach(STATION_FILE, "application/toml", self._station.text)
+        return writer
+
+
+def bus_recording_name(bus: str, time_ns: int) -> str:
+    return f"{bus}-{stamp(time_ns)}.mcap"
+
+
+# A unit that is recorded.
+
+
+class UnitRecording(AtRecording):
+    """One unit's recording, at ``path_of`` its identity, in ``segments`` where
+    they are given; ``identified`` is told who it is, once it is there."""
+
+    kind = "unit"
+
+    def __init__(
+        self,
+        session: UnitSession,
+        path_of: Callable[[IdentityRead], Path],
+        identified: Callable[[UnitSession, IdentityRead], None] = lambda *_: None,
+        segments: Segments | None = None,
+    ) -> None:
+        self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
+        super().__init__(session.name, self._recorded, session.progress)
+        self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
+
+    @property
+    def status(self) -> UnitStatus:
+        """Recorded is a unit of which samples come: what its FIFO held before is
+        discarded meanwhile, which may take a minute."""
+        status = super().status
+        if status.state is State.RECORDING and not status.counts["samples"]:
+            return replace(status, state=State.WAITING, trouble=NOTHING_YET)
+        return status
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return dict(self._recorded.streams[READINGS].counts)
+
+    @property
+    def _seconds(self) -> float:
+        return self._recorded.streams[READINGS].seconds
+
+    @property
+    def _host_seconds(self) -> float | None:
+        return self._recorded.streams[READINGS].host_seconds
+
+    @property
+    def _latest(self) -> dict[str, float]:
+        return dict(self._recorded.latest)
+
+    def _waits(self, patience: Patience, trouble: Exception) -> None:
+        self._is_lost(str(trouble))
+        self._session.waits(patience, trouble)
+
+    def _is_lost(self, trouble: str | None) -> None:
+        self._state = State.RECORDING if trouble is None else State.WAITING
+        self._trouble = trouble
+
+    def leave(self) -> None:
+        super().leave()
+        self._session.leave()
+
+    async def _work(self, seconds: float | None, patience: Patience) -> None:
+        session, found = self._session, list[IdentityRead]()
+
+        async def identify(device: Device) -> None:
+            found[:] = [await session.identify(device)]
+
+        async with session.place.opened(patience, partial(self._waits, patience), identify) as device:
+            (identity,) = found
+            self._identified(session, identity)
+            self._path = self._path_of(identity)
+
+            async def record(writer: RecordingWriter) -> None:
+                session.progress.stage(session.name, "recording")
+                confirmation = session.confirmation(device, identity, writer, self._recorded)
+                returning = session.returning(device, identity, patience, self._is_lost, confirmation)
+                try:
+                    async with confirmation.phase():
+                        await self._recorded.for_seconds(returning, writer, seconds)
+                finally:
+                    self._wrong, self._unconfirmed = confirmation.wrong, confirmation.unconfirmed
+
+            make = partial(session.writer, self._path, identity, segments=self._segments)
+            await self._recorded_by(make, record, self._path if self._segments else None)

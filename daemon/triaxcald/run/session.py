@@ -15,16 +15,15 @@ from triaxcald import text
 from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, identified
-from triaxcald.provision.snapshot import Snapshot, take_snapshot
+from triaxcald.provision.registers import Snapshot, take_snapshot
 from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.coming_back import HOLE_S, Patience, Returning, Streaming
-from triaxcald.station.config import Place, Station
-from triaxcald.station.confirmation import Confirmation
-from triaxcald.station.serials import SerialsSeen
+from triaxcald.station.config import Place, SerialsSeen, Station
+from triaxcald.station.output_check import Confirmation
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,17 @@ from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, DiskError, Implausible, StationError, TwoAnswer
 from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink
-from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
-from triaxcald.provision.correction import require_readings_before
 from triaxcald.provision.identity import WrongUnit
-from triaxcald.provision.image import RegisterImage
-from triaxcald.provision.plausible import Doubt, is_blank
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.registers import (
+    LEAST,
+    Doubt,
+    RegisterImage,
+    departure_g,
+    doubt_of_departure,
+    is_blank,
+    require_readings_before,
+)
 from triaxcald.provision.state import DeviceState
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Collection

@@ -3,31 +3,164 @@ Pure; time is an argument."""
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Mapping
+import struct
+import zlib
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from enum import IntFlag
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcald.simulation.memory import (
-    CALIBRATION,
-    CRC,
-    FIRMWARE_VERSION,
-    LOCK,
-    PRODUCT_CODE,
-    RESTART,
-    SAVE,
-    TABLE,
-    UNLOCK,
-    VENDOR_ID,
-    Stored,
-    checksum,
-    factory_calibration,
-)
-from triaxcald.simulation.physics import Physics
+from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.register_types import TYPES
+from triaxcal_drivers.registers import crc
+from triaxcald.abort import at_abort
+from triaxcald.errors import InputError
+from triaxcald.files import require_writable, write_bytes
+
+# What the simulated unit's sensor sees: voltages and a temperature as functions of
+# time.
+
+
+class Physics(Protocol):
+    def sample(self, unit_time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The sensor's output (n, 3) in V before the converter, and its
+        temperature (n,) in °C.
+
+        Times are in the unit's time base, ascending, each asked for once.
+        """
+
+    def restarted(self, unit_time_s: float) -> None:
+        """The unit starts again, as after its registers were written."""
+
+
+@dataclass(frozen=True)
+class ConstantPhysics:
+    """The same voltages [V] and temperature [°C] for ever."""
+
+    volts: tuple[float, float, float] = (0.0, 0.0, -2.4)
+    temperature_c: float = 25.0
+
+    def sample(self, unit_time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        n = len(unit_time_s)
+        return np.tile(np.array(self.volts, dtype=np.float64), (n, 1)), np.full(n, self.temperature_c)
+
+    def restarted(self, unit_time_s: float) -> None:
+        """It stands where it stood."""
+
+
+# The reference unit's registers as data, and its memory: the RAM copy in use and
+# the stored copy.
+
+Access = Literal["ro", "rw", "wo"]
+
+VENDOR_ID, PRODUCT_CODE, FIRMWARE_VERSION = 0x54524941, 0x7A01, 0x00010000
+UNLOCK, LOCK, SAVE, RESTART = 0x5A17, 0, 0x65766173, 0xB007
+
+
+@dataclass(frozen=True)
+class Entry:
+    type: Literal["uint16", "uint32", "float32"]
+    access: Access
+
+    @property
+    def size(self) -> int:
+        return TYPES[self.type].size
+
+    def encode(self, value: float) -> bytes:
+        """Most significant byte first."""
+        if self.type == "float32":
+            return struct.pack(">f", value)
+        return int(value).to_bytes(self.size, "big")
+
+    def decode(self, raw: bytes) -> float:
+        if self.type == "float32":
+            return float(struct.unpack(">f", raw)[0])
+        return int.from_bytes(raw, "big")
+
+
+_PER_AXIS = (
+    "scale_factor", "misalignment", "bias", "second_order", "temperature_bias", "temperature_scale_factor",
+)  # fmt: skip
+
+CRC = "calibration_crc"
+COVERED = (*(f"{name}_{axis}" for name in _PER_AXIS for axis in "xyz"),
+           "reference_temperature", "calibration_date")  # fmt: skip
+"""The calibration registers that the checksum covers, in its order."""
+CALIBRATION = (*COVERED, CRC)
+
+_INTEGERS: dict[str, Literal["uint16", "uint32"]] = {"calibration_date": "uint32", CRC: "uint16"}
+
+TABLE: Mapping[str, Entry] = {
+    "vendor_id": Entry("uint32", "ro"),
+    "product_code": Entry("uint32", "ro"),
+    "firmware_version": Entry("uint32", "ro"),
+    "serial_number": Entry("uint32", "ro"),
+    "status": Entry("uint16", "ro"),
+    "write_counter": Entry("uint32", "ro"),
+    "unlock_key": Entry("uint16", "wo"),
+    "store": Entry("uint32", "wo"),
+    "reset": Entry("uint16", "wo"),
+    **{name: Entry(_INTEGERS.get(name, "float32"), "rw") for name in CALIBRATION},
+    **{"stored_" + name: Entry(_INTEGERS.get(name, "float32"), "ro") for name in CALIBRATION},
+}
+"""Every register of the unit by name; ``stored_`` + name mirrors the stored
+copy."""
+
+
+def checksum(copy: Mapping[str, bytes]) -> bytes:
+    """The calibration_crc that belongs to a copy of the calibration registers,
+    as raw bytes."""
+    return crc("crc-16/modbus", b"".join(copy[name] for name in COVERED)).to_bytes(2, "big")
+
+
+def factory_calibration() -> dict[str, bytes]:
+    """The nominal scale factor and the reference temperature; nothing else,
+    dated 1970-01-01."""
+    values = {f"scale_factor_{axis}": -2.4 for axis in "xyz"} | {"reference_temperature": 25.0}
+    copy = {name: TABLE[name].encode(values.get(name, 0.0)) for name in COVERED}
+    return copy | {CRC: checksum(copy)}
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The stored copy: calibration registers as raw bytes, times stored, and
+    whether it was read whole."""
+
+    calibration: Mapping[str, bytes]
+    write_counter: int = 0
+    intact: bool = True
+
+    @property
+    def valid(self) -> bool:
+        return self.intact and checksum(self.calibration) == self.calibration[CRC]
+
+    def image(self) -> bytes:
+        """The bytes of the EEPROM: calibration registers in order, write
+        counter, CRC-32 over both."""
+        body = b"".join(self.calibration[name] for name in CALIBRATION) + self.write_counter.to_bytes(4, "big")
+        return body + zlib.crc32(body).to_bytes(4, "big")
+
+    @staticmethod
+    def from_image(image: bytes) -> Stored:
+        """What the unit finds at start-up. An image that is damaged, or of
+        another length, is not intact."""
+        sizes = [TABLE[name].size for name in CALIBRATION]
+        expected = sum(sizes) + 8
+        whole = image[:expected].ljust(expected, b"\xff")  # an erased cell reads as ones
+        copy, at = {}, 0
+        for name, size in zip(CALIBRATION, sizes, strict=True):
+            copy[name] = whole[at : at + size]
+            at += size
+        intact = len(image) == expected and zlib.crc32(whole[:-4]).to_bytes(4, "big") == whole[-4:]
+        return Stored(copy, int.from_bytes(whole[at : at + 4], "big"), intact)
+
 
 FULL_SCALE_V, FULL_SCALE_COUNTS = 10.0, 2**23
 INVALID_CORRECTED = -(2**31)
@@ -295,3 +428,59 @@ class ReferenceUnit:
 
     def _axes(self, quantity: str) -> NDArray[np.float64]:
         return np.array([TABLE[f"{quantity}_{a}"].decode(self._ram[f"{quantity}_{a}"]) for a in "xyz"])
+
+
+# The EEPROM of a simulated unit as a file, so that it survives the process.
+
+LOOK_S = 0.05
+EEPROM_MOST = 4096
+"""Bytes; the unit's has 90. What is longer is somebody's file, and not to be
+written over."""
+
+
+def read_eeprom(path: Path) -> bytes | None:
+    """None where there is no such file yet; it must be one that can be written.
+    Raises InputError."""
+    require_writable(path)
+    try:
+        return read_whole(path, EEPROM_MOST)
+    except FileNotFoundError:
+        return None
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}") from e
+
+
+def write_eeprom(path: Path, image: bytes) -> None:
+    """Whole or not at all. Raises InputError."""
+    write_bytes(path, image)
+
+
+@asynccontextmanager
+async def keep_eeprom(unit: ReferenceUnit, path: Path | None) -> AsyncIterator[None]:
+    """Writes the unit's EEPROM to ``path`` whenever it changes, until the
+    context ends."""
+    if path is None:
+        yield
+        return
+
+    def keep(_: float) -> None:
+        with suppress(InputError):
+            write_eeprom(path, unit.eeprom)
+
+    task = asyncio.create_task(_follow(unit, path))
+    with at_abort(keep):
+        try:
+            yield
+        finally:
+            if not task.cancel():
+                task.result()
+            write_eeprom(path, unit.eeprom)
+
+
+async def _follow(unit: ReferenceUnit, path: Path) -> None:
+    held = read_eeprom(path)
+    while True:
+        if unit.eeprom != held:
+            held = unit.eeprom
+            write_eeprom(path, held)
+        await asyncio.sleep(LOOK_S)

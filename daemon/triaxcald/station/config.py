@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -26,13 +27,14 @@ from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
 from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml
 from triaxcal_drivers.validation import validate
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
 from triaxcald.station.coming_back import Patience, claimed, until_open
 
 if TYPE_CHECKING:
     from triaxcal.uncertainty import Stated
+
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -189,10 +191,10 @@ class StationFile(Strict):
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
         units, buses = [u.name for u in self.units], [b.name for b in self.buses]
-        for field, names in ("units", units), ("buses", units + buses):
+        for key, names in ("units", units), ("buses", units + buses):
             for name in names:
                 if names.count(name) > 1:
-                    raise ValueError(f"{field}: the name '{name}' is given twice")
+                    raise ValueError(f"{key}: the name '{name}' is given twice")
         for name in buses:
             if unit := taken_for(name, units):
                 raise ValueError(f"buses: recordings of unit {unit} may be called '{name}'")
@@ -298,13 +300,13 @@ class Station:
 
 
 def parse_station(text: bytes, *, where: str) -> StationFile:
-    """Raises ProfileError with file, line and field."""
+    """Raises ProfileError with file, line and key."""
     return validate(StationFile, parse_toml(text, where=where, expected=STATION), text, where=where)
 
 
 def load_station(path: Path) -> Station:
     """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line
-    with file, line and field."""
+    with file, line and key."""
     try:
         text = read_toml(path, expected=STATION, pipe=True)
     except OSError as e:
@@ -332,7 +334,7 @@ def load_station(path: Path) -> Station:
 
 
 def _check_distinct(places: Sequence[Place], *, where: str) -> None:
-    """No two units are one device. Raises InputError with the field of the
+    """No two units are one device. Raises InputError with the key of the
     later one."""
     for (_, a), (i, b) in combinations(enumerate(places), 2):
         if claim_of(a.bus) == claim_of(b.bus):
@@ -364,3 +366,66 @@ def _check_roles(bundle: Bundle, *, where: str) -> None:
                 f"{where}: {bundle.profile.name}: registers.{name}.role: "
                 f"unknown role '{register.role}'{nearest(register.role, known)}"
             )
+
+
+# What of a station is another, once its file has been written anew.
+
+
+def names_in(station: Station) -> set[str]:
+    """Of its units and buses."""
+    return {place.unit.name for place in station.places} | {bus.name for bus in station.buses}
+
+
+def changed(before: Station, after: Station) -> set[str]:
+    """Names of units and buses that are gone, new, or not as they were. All are,
+    where the station says something else of itself: each recording holds the
+    station file by which it is read."""
+    if _itself(before) != _itself(after):
+        return names_in(before) | names_in(after)
+    old, new = _each(before), _each(after)
+    return {name for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
+
+
+def _itself(station: Station) -> object:
+    return station.file.model_copy(update={"units": (), "buses": ()})
+
+
+def _each(station: Station) -> dict[str, object]:
+    units = {place.unit.name: _of_unit(place) for place in station.places}
+    return {**units, **{bus.name: (bus.settings, bus.given) for bus in station.buses}}
+
+
+def _of_unit(place: Place) -> object:
+    return place.unit, place.bundle.text, dict(place.bundle.files)
+
+
+# The serial numbers that the units of one run report: a unit that answers in two
+# places is one of them mixed up.
+
+
+@dataclass
+class SerialsSeen:
+    _places: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    def add(self, serial: str | None, unit: str, address: str) -> None:
+        """Raises SerialTwice if another place has reported it before. None is a
+        serial that nobody can read."""
+        here = unit, address
+        other = here if serial is None else self._places.setdefault(serial, here)
+        if other != here:
+            places = ", and ".join(f"unit {name} ({where})" for name, where in (other, here))
+            raise SerialTwice(f"serial {serial} answers in two places: {places}")
+
+    def discard(self, unit: str) -> None:
+        """What this unit has reported."""
+        self._places = {serial: place for serial, place in self._places.items() if place[0] != unit}
+
+
+# The calendar: the one place where the date of today enters.
+
+DAY_S = 86_400
+
+
+def days_since_1970(now_s: float | None = None) -> int:
+    """Whole days since 1970-01-01 UTC, as `calibration_date` counts them."""
+    return int((time.time() if now_s is None else now_s) // DAY_S)

@@ -3,9 +3,10 @@ what is not is asked for by its option."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,271 @@ from triaxcal_drivers.file_kind import document_kind
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
-from triaxcald.tables.arrow import MOSTLY
-from triaxcald.tables.channels import VALUE_LIMIT, channels_of
+from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
+from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import OUTPUTS, TIME, Name, Roles, Unclear, column_of, roles_of
 from triaxcald.tables.own_text import REQUIRED, CsvSamples, header_of, is_applied, is_own, samples_of_blocks
-from triaxcald.tables.rows import require_numbers, require_one_sensor, rows_in_time, rows_where, rows_with_numbers
 from triaxcald.tables.source import blocks, label_of, whole_lines
 from triaxcald.tables.timing import Timing, is_no_time, times_of, timing_of, with_joined_times
+
+# Which rows of a table are samples: those of one sensor, with a number in each cell
+# that is needed, at times that rise.
+
+ROWS_LOOKED_AT = 10_000
+"""For the words in a column: those that come in turn come early."""
+SENSORS = frozenset(("sensor", "sensors", "type", "id", "device", "source", "node", "side", "imu", "name"))
+"""Words by which a column of numbers names the sensor that a row is of."""
+VALUES_MOST, IN_TURN = 50, 0.2
+"""Sensors are few, and their rows come in turn; a label of what was done
+changes rarely."""
+FAR = 1e4
+"""Times what nine in ten samples reach: more is no reading, as a knock reaches
+the end of the range."""
+_SENSORS = re.compile(r"acc|gyr|mag|baro|grav|rotat|orient|linear", re.IGNORECASE)
+
+
+def rows_where(grid: Grid, where: Mapping[str, str]) -> NDArray[np.bool_]:
+    """(n,) those that have these values in these columns. Raises Unclear."""
+    n = len(grid.columns[0].numbers) if grid.columns else 0
+    chosen = np.ones(n, bool)
+    for name, value in where.items():
+        found = [i for i, held in enumerate(grid.names) if name in (held, Name.of(held).text)]
+        if len(found) != 1:
+            has = ", ".join(Name.of(held).text for held in grid.names) if grid.named else "no header"
+            raise Unclear(f"--where {name}={value}: {len(found)} columns of that name; the table has {clipped(has)}")
+        column = grid.columns[found[0]]
+        chosen &= column.equals(value)
+        if not chosen.any():
+            raise Unclear(f"--where {name}={value}: no row has that; it has {clipped(', '.join(_distinct(column)))}")
+    return chosen
+
+
+def _distinct(column: Column, most: int = 20) -> list[str]:
+    return sorted({column.text(row) for row in range(min(len(column.numbers), ROWS_LOOKED_AT))})[:most]
+
+
+def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
+    """Rows of several sensors below each other, as some phones write them,
+    would be read as one that jumps. Raises Unclear."""
+    for i, column in enumerate(grid.columns):
+        by_number = bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named
+        if column.strange[chosen].mean() > MOSTLY and _of_quantities(column, by_number):
+            continue
+        values = _in_turn(column, chosen, by_number)
+        if values:
+            raise Unclear(
+                f"rows of several sensors in turn ({grid.called(i)}: {clipped(', '.join(values))}); choose those of "
+                f"one: --where {Name.of(grid.names[i]).text}={values[0]}"
+            )
+        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > MOSTLY:
+            continue
+        texts = {column.text(int(row)) for row in np.flatnonzero(chosen)[:ROWS_LOOKED_AT]}
+        if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
+            wanted = next((t for t in sorted(texts) if re.search("acc", t, re.IGNORECASE)), min(texts))
+            raise Unclear(
+                f"rows of several sensors ({grid.called(i)}: {clipped(', '.join(sorted(texts)))}); choose "
+                f"those of one: --where {Name.of(grid.names[i]).text}={wanted}"
+            )
+
+
+def _of_quantities(column: Column, by_number: bool) -> bool:
+    """Whether a column of texts holds numbers with the other decimal mark than
+    the table's. They name no sensor, unless the column's name says that its
+    numbers do, and they have no fraction."""
+    texts = [column.text(int(row)) for row in np.flatnonzero(column.strange)[:ROWS_LOOKED_AT]]
+    if not texts or not all(map(NUMBER.fullmatch, texts)):
+        return False
+    return not by_number or any(float(t.replace(",", ".")) % 1 for t in texts)
+
+
+def _in_turn(column: Column, chosen: NDArray[np.bool_], by_number: bool) -> list[str]:
+    """The few values that a column of texts, or of numbers that name something,
+    has in turn from row to row."""
+    rows = np.flatnonzero(chosen)[:ROWS_LOOKED_AT]
+    numbered = by_number and column.whole is not None and column.usable[rows].mean() > MOSTLY
+    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > MOSTLY):
+        return []
+    names = column.whole if numbered else None
+    held = [column.text(int(r)) if names is None else str(names[r]) for r in rows]
+    values = sorted(set(held), key=lambda v: ("acc" not in v.lower(), v))
+    turns = sum(a != b for a, b in pairwise(held)) / len(held)
+    few = 1 < len(values) <= min(VALUES_MOST, len(held) // 4)
+    return values if few and turns > IN_TURN else []
+
+
+def require_numbers(grid: Grid, i: int, chosen: NDArray[np.bool_]) -> None:
+    """Of a column that is an output: most of its cells are numbers, if not
+    all."""
+    column = grid.columns[i]
+    if column.moments_ns is not None or (chosen & column.usable).sum() * 2 <= (chosen & column.strange).sum():
+        rows = np.flatnonzero(chosen & (column.strange | (column.moments_ns is not None)))
+        if not len(rows):
+            raise Unclear(f"{grid.called(i)} holds no number" if len(column.numbers) else "no samples, expected some")
+        row = int(rows[0])
+        raise Unclear(f"{grid.line_of(row)}: {grid.called(i)}: '{column.text(row)[:40]}', expected a finite number")
+
+
+def rows_with_numbers(
+    grid: Grid, needed: Sequence[int], chosen: NDArray[np.bool_], skip_bad: bool
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """The rows with a number in each of the columns that are needed. Raises
+    Unclear where there are others, unless they are to be skipped; what to say
+    of them."""
+    usable = chosen.copy()
+    for i in needed:
+        usable &= grid.columns[i].usable
+    far = usable & _far(grid, needed[: len(OUTPUTS)], usable)
+    usable &= ~far.any(axis=0)
+    bad = chosen & ~usable
+    faults = []
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        too_far = [i for i, of_column in zip(needed, far, strict=False) if of_column[row]]
+        i = next((i for i in needed if not grid.columns[i].usable[row]), *too_far[:1])
+        held = grid.columns[i].text(row)
+        what = f"'{held[:40]}'" if held else "empty"
+        expected = f"a number within {FAR:g} times most others" if i in too_far else "a finite number"
+        faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected {expected}")
+    for line, fields in grid.ragged[:1]:
+        faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
+    count = int(bad.sum()) + len(grid.ragged)
+    if not count:
+        return usable, []
+    if not skip_bad:
+        raise Unclear(f"{faults[0]}; {count} such lines: --skip-bad leaves them out")
+    return usable, [f"{count} of {int(chosen.sum()) + len(grid.ragged)} lines left out (--skip-bad); {faults[0]}"]
+
+
+def _far(grid: Grid, outputs: Sequence[int], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(3,n) cells that hold something else than outputs: a line garbled on its
+    way, a moment in the place of a header."""
+    sizes = np.abs(np.nan_to_num([grid.columns[i].numbers for i in outputs]))
+    if not usable.any():
+        return np.zeros(sizes.shape, bool)
+    return np.asarray(sizes > FAR * np.quantile(sizes.max(axis=0)[usable], 0.9))
+
+
+def rows_in_time(
+    grid: Grid,
+    time: int | None,
+    rows: NDArray[np.intp],
+    time_ns: NDArray[np.int64],
+    readings: NDArray[np.float64],
+    channels: Mapping[str, NDArray[np.float64]],
+) -> NDArray[np.bool_]:
+    """Which rows are no exact repetition of the one before; ``time`` is the
+    column of the times. Raises Unclear where these do not rise."""
+    step = np.diff(time_ns)
+    values = np.column_stack([readings, *channels.values()])
+    repeated = (step == 0) & (values[1:] == values[:-1]).all(axis=1)
+    wrong = np.flatnonzero((step <= 0) & ~repeated)
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        what = "is that of the line before" if step[at - 1] == 0 else "is before that of the line before"
+        column = "the time" if time is None else f"{grid.called(time)}: the time"
+        raise Unclear(
+            f"{grid.line_of(int(rows[at]))}: {column} {what} ({len(wrong)} such lines), expected times that rise; "
+            "where samples are evenly spaced, --rate HZ counts them instead"
+        )
+    return np.concatenate(([True], ~repeated))
+
+
+# Which columns of a table are channels: quantities logged beside the outputs, such
+# as a temperature.
+
+VALUE_LIMIT = 1e100
+"""Squares of values, and sums of them, have to be numbers too."""
+COMPUTED_LEAST = 0.999
+"""Correlation with the magnitude of the outputs above which a column is
+computed from them; a temperature that is measured has not a thousandth of
+it."""
+CELSIUS = (-60.0, 150.0)
+"""A thermometer of degrees Celsius beside a sensor shows no other; counts of a
+converter are beyond."""
+
+
+def channels_of(
+    grid: Grid,
+    roles: Roles,
+    names: Sequence[Name],
+    timing: Timing,
+    rows: NDArray[np.intp],
+    readings: NDArray[np.float64],
+    wanted: frozenset[str],
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, int], list[str]]:
+    """All other columns of numbers without gaps, which of them have another
+    name than their column, and why the others are not among them."""
+    channels = {role: grid.columns[i].numbers[rows] for role, i in roles.channels.items()}
+    renamed: dict[str, int] = {}
+    left_out: list[str] = []
+    used = {*roles.outputs, *roles.channels.values(), timing.column, timing.index}
+    celsius = [i for i, n in enumerate(names) if n.is_celsius and i not in used]
+    celsius = [i for i in celsius if names[i].unit or not names[i].is_either] or celsius
+    magnitude = np.linalg.norm(readings, axis=1)
+    for i, column in enumerate(grid.columns):
+        if i in used:
+            continue
+        name = re.sub(r'[,\s"]+', " ", names[i].text if grid.named else f"column {i + 1}").strip()
+        values = column.numbers[rows]
+        if name in wanted and name not in channels and not (column.strange | column.gaps)[rows].any():
+            channels[name] = values
+            continue
+        reason = _another_quantity(grid, roles, names[i], i, rows) or _unfit(column, rows, magnitude)
+        if reason is None and (not name or name in (*OUTPUTS, "t_s") or name in channels):
+            reason = "its name is taken" if name else "it has no name"
+        if reason is not None:
+            left_out.append(f"{name or f'column {i + 1}'} ({reason})")
+            continue
+        if [i] == celsius and "temp_c" not in channels and _as_celsius(values):
+            name = "temp_c"
+            renamed[name] = i
+        channels[name] = values
+    return channels, renamed, left_out
+
+
+def _another_quantity(grid: Grid, roles: Roles, name: Name, i: int, rows: NDArray[np.intp]) -> str | None:
+    """Why a column is none that an effect may go with, by its name and by how
+    its numbers run; None where nothing speaks against it."""
+    column, values = grid.columns[i], grid.columns[i].numbers[rows]
+    clock_of_its_own = name.is_either and len(values) > 1 and bool((np.diff(values) > 0).all())
+    if i in roles.time or clock_of_its_own or column.moments_ns is not None:
+        return "another time"
+    if i in roles.indices or _counts(column, rows):
+        return "an index"
+    if i in roles.rivals:
+        return "other outputs"
+    if grid.named and name.is_without_gravity:
+        return "without gravity"
+    if grid.named and name.is_computed:
+        return "computed from the outputs"
+    return None
+
+
+def _unfit(column: Column, rows: NDArray[np.intp], magnitude: NDArray[np.float64]) -> str | None:
+    if column.strange[rows].any():
+        return "no numbers"
+    if column.gaps[rows].any():
+        return f"{int(column.gaps[rows].sum())} of {len(rows)} cells empty"
+    values = column.numbers[rows]
+    if (np.abs(values) >= VALUE_LIMIT).any():
+        return "values too large"
+    if len(rows) > 2 and np.ptp(values) > 0 and np.ptp(magnitude) > 0:
+        with np.errstate(all="ignore"):
+            correlation = np.corrcoef(values, magnitude)[0, 1]
+        if abs(correlation) > COMPUTED_LEAST:
+            return "computed from the outputs"
+    return None
+
+
+def _counts(column: Column, rows: NDArray[np.intp]) -> bool:
+    """Whether it numbers the rows, whatever its name: as a channel it would be
+    the time again."""
+    return column.whole is not None and len(rows) > 2 and bool((np.diff(column.whole[rows]) == np.diff(rows)).all())
+
+
+def _as_celsius(values: NDArray[np.float64]) -> bool:
+    return bool(CELSIUS[0] <= values.min() and values.max() <= CELSIUS[1])
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,10 @@ from typing import Any
 
 import pytest
 
-from triaxcald.cli.json_lines import JsonLines
+from triaxcald.cli.record import JsonLines
 from triaxcald.recording import disk
 from triaxcald.recording.reader import Recording
-from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
-from triaxcald.simulation.unit import Faults
+from triaxcald.simulation.unit import CALIBRATION, TABLE, Faults, Stored, factory_calibration
 from triaxcald.station.collection import Recorded
 
 Run = Callable[..., Any]

@@ -15,11 +15,11 @@ import pytest
 
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
-from triaxcald.provision.restore import restore as put_back
+from triaxcald.provision.procedure import restore as put_back
 from triaxcald.provision.state import Evidence
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
+from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())

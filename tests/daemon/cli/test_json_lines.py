@@ -6,7 +6,7 @@ import io
 import json
 from datetime import UTC, datetime
 
-from triaxcald.cli.json_lines import JsonLines
+from triaxcald.cli.record import JsonLines
 
 NOW = datetime(2026, 3, 1, 12, 0, 0, 250_000, UTC)
 

@@ -18,8 +18,7 @@ import pytest
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.running import run
-from triaxcald.errors import DiskError, RecordingError
-from triaxcald.exit_codes import exit_code_of
+from triaxcald.errors import DiskError, RecordingError, exit_code_of
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording.file import RecordingFile
 from triaxcald.recording.writer import RecordingWriter

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from triaxcal.progress import Stage
-from triaxcald.cli import progress
-from triaxcald.cli.progress import BEAT_S, ERASE, PLAIN_S, SILENT_S, WORDS, ProgressLine
+from triaxcald.cli import console as progress
+from triaxcald.cli.console import BEAT_S, ERASE, PLAIN_S, SILENT_S, WORDS, ProgressLine
 
 
 @dataclass

@@ -18,7 +18,7 @@ from triaxcal_drivers.loading import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
 from triaxcald.provision.state import Held
 from triaxcald.run.line import Outcome
-from triaxcald.simulation.memory import Stored, factory_calibration
+from triaxcald.simulation.unit import Stored, factory_calibration
 from triaxcald.verification import Verification
 
 Run = Callable[..., Any]

@@ -12,8 +12,8 @@ import pytest
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
-from triaxcald.cli.arguments import parsed
 from triaxcald.cli.commands import parser
+from triaxcald.cli.syntax import parsed
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0

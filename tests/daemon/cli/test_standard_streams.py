@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from tests.daemon.cli.test_device_commands import CAL
-from triaxcald.simulation.memory import Stored, factory_calibration
-from triaxcald.simulation.unit import Faults
+from triaxcald.simulation.unit import Faults, Stored, factory_calibration
 
 PROGRAM = Path(sys.executable).with_name("triaxcal")
 OLD = Stored(factory_calibration())

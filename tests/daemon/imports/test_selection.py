@@ -8,7 +8,7 @@ from triaxcal_drivers.can.layout import Layout, Message, Signal
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import LoggedFrame
 from triaxcald.errors import InputError
-from triaxcald.imports.selection import Selection
+from triaxcald.imports.of_can import Selection
 
 UX = Signal("ux", 0, 8)
 

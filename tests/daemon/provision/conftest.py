@@ -16,15 +16,23 @@ from triaxcal_drivers.registers import ByteOrder
 from triaxcald.audit.differences import Difference
 from triaxcald.audit.traffic import Said, Traffic, check
 from triaxcald.outcome import registers_told
-from triaxcald.provision.access import RegisterAccess, RegisterLink
-from triaxcald.provision.image import build_image
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace, RegisterAccess, RegisterLink
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.registers import build_image
 from triaxcald.provision.state import Held
 from triaxcald.recording import schema
-from triaxcald.simulation.memory import CALIBRATION, CRC, TABLE, Stored
-from triaxcald.simulation.physics import ConstantPhysics
-from triaxcald.simulation.unit import Faults, ReferenceUnit, RegisterFault, Status, UnitSilent
+from triaxcald.simulation.unit import (
+    CALIBRATION,
+    CRC,
+    TABLE,
+    ConstantPhysics,
+    Faults,
+    ReferenceUnit,
+    RegisterFault,
+    Status,
+    Stored,
+    UnitSilent,
+)
 
 LIMITS = {
     "scale_factor": 10.0, "misalignment": 0.1, "bias": 0.5, "second_order": 0.01,

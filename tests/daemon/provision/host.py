@@ -19,13 +19,10 @@ from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSi
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import DaemonError
-from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import parse
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace, RegisterLink
+from triaxcald.provision.journal import journaled_image, parse
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.snapshot import Snapshot
-from triaxcald.provision.unfinished import journaled_image
+from triaxcald.provision.registers import RegisterImage, Snapshot, image_of
 
 ERRORS = Errors(DeviceSilent, DeviceAbsent, BusError, DeviceSilent, RegisterRefused, DeviceBusy)
 Truth = Literal["old", "new", "mixture"]

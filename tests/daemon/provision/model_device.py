@@ -15,7 +15,7 @@ from typing import Any, Literal
 from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace
 
 Fault = Literal[
     "lost", "duplicated", "late", "torn", "reverted on lock", "ignored", "forgotten", "second unit answers", "flipped"

@@ -17,8 +17,7 @@ from triaxcal.errors import Refused
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Profile
-from triaxcald.provision.correction import not_neutral, require_readings_before
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.registers import Snapshot, not_neutral, require_readings_before
 
 PATIENT = Timing(reply_s=10.0, silence_s=20.0, store_poll_s=20.0, reconnect_s=20.0)
 KEY = '[correction] readings = "before"'

@@ -1,7 +1,7 @@
 import pytest
 
 from triaxcald.provision.explain import explain
-from triaxcald.provision.snapshot import Snapshot, take_snapshot
+from triaxcald.provision.registers import Snapshot, take_snapshot
 
 
 @pytest.mark.parametrize("little_endian", [False, True])

@@ -5,7 +5,7 @@ import pytest
 from triaxcal_drivers.errors import ProfileError, RegisterValueError
 from triaxcal_drivers.registers import crc
 from triaxcald.errors import InputError
-from triaxcald.provision.image import build_image
+from triaxcald.provision.registers import build_image
 
 COEFFICIENTS = {
     "scale_factor.x": -2.41,

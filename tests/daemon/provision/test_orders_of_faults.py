@@ -18,10 +18,9 @@ from tests.daemon.provision.model_device import FAULTS, NEW, OLD, OTHERS, Fault,
 from triaxcal_drivers.errors import DriverError
 from triaxcald.errors import DaemonError
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.image import image_of
 from triaxcald.provision.journal import parse
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.registers import Snapshot, image_of
 from triaxcald.provision.state import DeviceState, Evidence
 
 KINDS = [

@@ -13,7 +13,7 @@ from tests.devices.in_memory import VirtualClock
 from tests.devices.profiles import profile_text
 from triaxcal_drivers.errors import DeviceBusy, DeviceSilent, RegisterRefused
 from triaxcal_drivers.loading import parse_bundle
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace
 from triaxcald.provision.power import least_off_s, power_cycled
 
 PROFILE = parse_bundle(profile_text("modbus", Habits()).encode(), {}, where="a profile").profile

@@ -2,13 +2,10 @@ import pytest
 
 from triaxcald.errors import ProvisionError
 from triaxcald.provision.identity import WrongUnit
-from triaxcald.provision.image import RegisterImage, build_image
-from triaxcald.provision.restore import restore
-from triaxcald.provision.snapshot import take_snapshot
+from triaxcald.provision.procedure import restore
+from triaxcald.provision.registers import RegisterImage, build_image, take_snapshot
 from triaxcald.provision.state import DeviceState, Evidence
-from triaxcald.simulation.memory import CALIBRATION, Stored
-from triaxcald.simulation.physics import ConstantPhysics
-from triaxcald.simulation.unit import Faults, ReferenceUnit
+from triaxcald.simulation.unit import CALIBRATION, ConstantPhysics, Faults, ReferenceUnit, Stored
 
 
 @pytest.mark.parametrize("little_endian", [False, True])

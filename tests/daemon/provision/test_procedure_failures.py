@@ -9,9 +9,7 @@ from triaxcal_drivers.errors import DeviceSilent, DriverError, RegisterRefused
 from triaxcald.errors import ProvisionError
 from triaxcald.provision.procedure import to_its_end
 from triaxcald.provision.state import DeviceState, Evidence
-from triaxcald.simulation.memory import CALIBRATION, Stored
-from triaxcald.simulation.physics import ConstantPhysics
-from triaxcald.simulation.unit import Faults, ReferenceUnit
+from triaxcald.simulation.unit import CALIBRATION, ConstantPhysics, Faults, ReferenceUnit, Stored
 
 OLD, UNTOUCHED, UNKNOWN = DeviceState.OLD, DeviceState.UNTOUCHED, DeviceState.UNKNOWN
 NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)

@@ -17,16 +17,13 @@ from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import ProvisionError
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.explain import explain
-from triaxcald.provision.image import build_image
-from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.restore import restore
+from triaxcald.provision.procedure import Provisioning, restore
+from triaxcald.provision.registers import build_image
 from triaxcald.provision.state import DeviceState
 from triaxcald.simulation.can_unit import CanUnit
-from triaxcald.simulation.memory import Stored, factory_calibration
 from triaxcald.simulation.modbus_unit import ModbusUnit
-from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import RealTimeBase
-from triaxcald.simulation.unit import Faults, ReferenceUnit
+from triaxcald.simulation.unit import ConstantPhysics, Faults, ReferenceUnit, Stored, factory_calibration
 
 COEFFICIENTS = {"scale_factor.x": -2.41, "scale_factor.y": -2.39, "scale_factor.z": -2.405, "bias.x": 0.0125,
                 "misalignment.z": 0.002, "temperature_bias.y": 1e-4, "reference_temperature": 23.0}  # fmt: skip

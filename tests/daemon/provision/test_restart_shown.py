@@ -11,9 +11,9 @@ from triaxcal_drivers.errors import DeviceSilent
 from triaxcald.audit.traffic import Traffic
 from triaxcald.provision.access import RegisterAccess
 from triaxcald.provision.identity import WrongUnit
-from triaxcald.provision.image import build_image
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.proof import Restart, may_mark, proven_restart
+from triaxcald.provision.registers import build_image
 from triaxcald.provision.sequence import SequenceStalled
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording import schema

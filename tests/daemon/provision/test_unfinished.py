@@ -12,10 +12,8 @@ from tests.devices.profiles import profile_text
 from tests.devices.table import NEW, OLD
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Profile
-from triaxcald.provision.image import image_of
-from triaxcald.provision.journal import Entry, Step
-from triaxcald.provision.snapshot import Snapshot
-from triaxcald.provision.unfinished import was_cut_short
+from triaxcald.provision.journal import Entry, Step, was_cut_short
+from triaxcald.provision.registers import Snapshot, image_of
 
 HABITS = Habits()
 BEFORE, WANTED = OLD.image(HABITS), NEW.image(HABITS)

@@ -24,7 +24,7 @@ from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity, same_serial
-from triaxcald.provision.image import checksum_of
+from triaxcald.provision.registers import checksum_of
 from triaxcald.provision.sequence import SequenceStalled, run_sequence
 from triaxcald.recording.reader import Recording
 

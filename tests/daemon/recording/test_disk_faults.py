@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.interface import RawBatch
-from triaxcald.errors import DiskError
-from triaxcald.exit_codes import DISK
+from triaxcald.errors import DISK, DiskError
 from triaxcald.recording import disk
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from triaxcald.recording import evidence as evidence_module
-from triaxcald.recording.evidence import NAMES_MOST, EvidenceIndex, evidence_in
+from triaxcald.recording import segments as evidence_module
 from triaxcald.recording.manifest import Manifest, Segment
+from triaxcald.recording.segments import NAMES_MOST, EvidenceIndex, evidence_in
 
 SHA = [f"{i:064x}" for i in range(0xABC0, 0xABC0 + 40)]
 

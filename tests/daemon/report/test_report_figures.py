@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from triaxcald.report import StreamOverview, thin
+from triaxcald.report.charts import equal_area
 from triaxcald.report.figures import clean, digits, effect_title, micro_g, number, p_value, plus_minus
-from triaxcald.report.sphere import equal_area
 
 
 @pytest.mark.parametrize(

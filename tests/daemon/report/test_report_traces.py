@@ -14,7 +14,7 @@ import pytest
 
 from triaxcal.evidence.partial_residuals import Quantity
 from triaxcald.report import render_report
-from triaxcald.report.traces import read_traces
+from triaxcald.report.charts import read_traces
 
 _spec = spec_from_file_location("sample_documents", Path(__file__).with_name("sample_documents.py"))
 assert _spec is not None

@@ -25,8 +25,7 @@ from triaxcald.recording.bus import frame_rows
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import BUS_RECORD
 from triaxcald.run import recording as recording_module
-from triaxcald.run.bus_recording import BusRecording
-from triaxcald.run.recording import State
+from triaxcald.run.recording import BusRecording, State
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station
 

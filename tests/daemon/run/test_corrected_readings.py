@@ -19,8 +19,7 @@ from tests.devices.profiles import Wording, profile_text, station_text
 from tests.devices.table import Coefficients
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
-from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.pace import Pace
+from triaxcald.provision.access import Pace, RegisterLink
 from triaxcald.run import session, write_back
 from triaxcald.station import collection
 from triaxcald.station.config import Place

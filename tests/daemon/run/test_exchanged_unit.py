@@ -25,7 +25,7 @@ from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
 from triaxcald.run.line import run_station
-from triaxcald.station import confirmation
+from triaxcald.station import output_check as confirmation
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 

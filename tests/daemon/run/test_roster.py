@@ -9,11 +9,9 @@ from typing import Any
 
 import pytest
 
-from triaxcald.errors import DiskError, RecordingError
-from triaxcald.exit_codes import DISK, INTERRUPTED
+from triaxcald.errors import DISK, INTERRUPTED, DiskError, RecordingError
 from triaxcald.recording.schema import Phase
-from triaxcald.run.recording import AtRecording, Kept, State
-from triaxcald.run.roster import Roster
+from triaxcald.run.recording import AtRecording, Kept, Roster, State
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.guidance import Guide
 from triaxcald.station.raw_records import RawRecords

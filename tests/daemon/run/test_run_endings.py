@@ -21,7 +21,7 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run import line as station_line
 from triaxcald.run.line import Outcome, UnitRun, run_station
 from triaxcald.simulation.can_unit import CanUnit
-from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
+from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
 from triaxcald.station.config import load_station
 
 Run = Callable[..., Any]

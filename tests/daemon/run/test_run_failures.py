@@ -15,8 +15,7 @@ from triaxcald.documents import to_text
 from triaxcald.errors import DiskError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
-from triaxcald.simulation.unit import Faults
+from triaxcald.simulation.unit import CALIBRATION, Faults, Stored, factory_calibration
 
 OLD = Stored(factory_calibration())
 QUICK: Mapping[str, Any] = {"speed": 60.0, "fixture": {"poses": 12, "hold_s": 1.4, "move_s": 0.6}}

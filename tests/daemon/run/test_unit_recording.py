@@ -17,10 +17,8 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import Kept, State
-from triaxcald.run.roster import Roster
+from triaxcald.run.recording import Kept, Roster, State, UnitRecording
 from triaxcald.run.session import UnitSession
-from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station

@@ -17,14 +17,13 @@ from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
 from triaxcald.errors import DiskError, ProvisionError, RecordingError, StationError
 from triaxcald.inputs import CALIBRATION as TUMBLE
-from triaxcald.provision.image import RegisterImage, build_image
-from triaxcald.provision.restore import restore
+from triaxcald.provision.procedure import restore
+from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.line import UnitRun
 from triaxcald.run.write_back import WriteBack
-from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
-from triaxcald.simulation.unit import Faults
+from triaxcald.simulation.unit import CALIBRATION, TABLE, Faults, Stored, factory_calibration
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station, load_station
 from triaxcald.verification import Verification, verify

@@ -18,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
-from triaxcald.service.metrics import served
+from triaxcald.service.supervisor import served
 
 COUNTS = {"samples": 1000, "missing": 7, "errors": 2, "malformed": 4}
 

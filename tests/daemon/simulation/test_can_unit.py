@@ -21,10 +21,16 @@ from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.registers import crc
 from triaxcald.simulation.can_unit import CanUnit, tpdos
-from triaxcald.simulation.memory import COVERED, TABLE
-from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import RealTimeBase, SteppedTimeBase
-from triaxcald.simulation.unit import INVALID_CORRECTED, Faults, ReferenceUnit, SampleRun
+from triaxcald.simulation.unit import (
+    COVERED,
+    INVALID_CORRECTED,
+    TABLE,
+    ConstantPhysics,
+    Faults,
+    ReferenceUnit,
+    SampleRun,
+)
 
 SERIAL = 0x4D
 
@@ -311,7 +317,7 @@ SERVE = """
 import asyncio, sys
 from triaxcal_drivers.can.model import CanBus
 from triaxcald.simulation.can_unit import CanUnit
-from triaxcald.simulation.physics import ConstantPhysics
+from triaxcald.simulation.unit import ConstantPhysics
 from triaxcald.simulation.time_base import RealTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 

@@ -10,7 +10,7 @@ import can
 import pytest
 
 from triaxcal_drivers.can.model import CanBus
-from triaxcald.simulation.frames_waiting import BEHIND_BYTES, BEHIND_FRAMES, reader_is_behind, waiting_bytes
+from triaxcald.simulation.can_unit import BEHIND_BYTES, BEHIND_FRAMES, reader_is_behind, waiting_bytes
 
 FRAME = can.Message(arbitration_id=0x185, is_extended_id=False, data=bytes(8))
 

@@ -16,11 +16,9 @@ from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.modbus.protocol import READ_INPUT, SerialLine, TcpAddress
 from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.registers import crc
-from triaxcald.simulation.memory import CALIBRATION, COVERED, TABLE
-from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, WINDOW_WORDS, ModbusMap, ModbusUnit
-from triaxcald.simulation.serial_pair import pty_pair
+from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, WINDOW_WORDS, ModbusMap, ModbusUnit, pty_pair
 from triaxcald.simulation.time_base import RealTimeBase, SteppedTimeBase
-from triaxcald.simulation.unit import Faults, ReferenceUnit
+from triaxcald.simulation.unit import CALIBRATION, COVERED, TABLE, Faults, ReferenceUnit
 
 TEXT = (BUILT_IN / "triax-ref-modbus.toml").read_text("utf-8")
 LOOPBACK = TcpAddress("127.0.0.1", 0)

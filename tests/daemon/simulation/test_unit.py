@@ -3,10 +3,12 @@ import struct
 import numpy as np
 import pytest
 
-from triaxcald.simulation.memory import CALIBRATION, COVERED, TABLE
-from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.unit import (
+    CALIBRATION,
+    COVERED,
     INVALID_CORRECTED,
+    TABLE,
+    ConstantPhysics,
     Faults,
     ReferenceUnit,
     RegisterFault,

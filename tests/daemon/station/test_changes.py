@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from triaxcald.station.changes import changed, names_in
-from triaxcald.station.config import load_station
+from triaxcald.station.config import changed, load_station, names_in
 
 LEFT, RIGHT = ({"name": name, "bus": {"host": "127.0.0.1", "port": port}} for name, port in (("left", 1), ("right", 2)))
 ALL = {"name": "all", "bus": {"interface": "virtual", "channel": "a"}}

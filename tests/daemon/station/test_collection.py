@@ -23,9 +23,8 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.can_unit import CanUnit, tpdos
 from triaxcald.simulation.modbus_unit import ModbusUnit
-from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import SteppedTimeBase
-from triaxcald.simulation.unit import ReferenceUnit
+from triaxcald.simulation.unit import ConstantPhysics, ReferenceUnit
 from triaxcald.station.collection import Collection, Recorded, _Watch
 from triaxcald.station.config import Plan
 from triaxcald.station.raw_records import OVERRUN

@@ -16,7 +16,7 @@ from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import StationError, TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.station.coming_back import Patience, Returning
-from triaxcald.station.confirmation import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
+from triaxcald.station.output_check import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
 
 BLANK = BlankIdentity("the unit on node 5 is serial 0000, expected 0777")
 OTHER = WrongUnit("the unit on node 5 is serial 0888, expected 0777")

@@ -20,8 +20,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import PREVIEWS
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.can_unit import tpdos
-from triaxcald.simulation.physics import ConstantPhysics
-from triaxcald.simulation.unit import ReferenceUnit
+from triaxcald.simulation.unit import ConstantPhysics, ReferenceUnit
 from triaxcald.station.collection import DECODE_S, Recorded
 
 IDENTIFIERS = (0x185, 0x285, 0x385, 0x485)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from triaxcald.errors import StationError
-from triaxcald.station.serials import SerialsSeen
+from triaxcald.station.config import SerialsSeen
 
 
 def test_a_serial_number_is_of_one_place() -> None:

@@ -15,7 +15,7 @@ from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import Handler, SerialLine, answer
 from triaxcal_drivers.modbus.stack import serve_serial
-from triaxcald.simulation.serial_pair import pty_pair
+from triaxcald.simulation.modbus_unit import pty_pair
 
 Make = Callable[..., Any]
 

@@ -22,9 +22,8 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import State
+from triaxcald.run.recording import State, UnitRecording
 from triaxcald.run.session import UnitSession
-from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE

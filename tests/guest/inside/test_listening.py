@@ -16,10 +16,8 @@ from tests.guest.inside.test_coming_back import Told, until
 from tests.guest.inside.witness import ERROR, EXTENDED, REMOTE, Seen, Sender, listeners, words_of
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.interface import RawFlag
-from triaxcald.run.bus_recording import BusRecording
-from triaxcald.run.recording import State
+from triaxcald.run.recording import BusRecording, State, UnitRecording
 from triaxcald.run.session import UnitSession
-from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE

@@ -1,0 +1,371 @@
+"""A device's calibration registers: their image, the values that they held and
+whether these are plausible, and the correction that they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects import effect_of
+from triaxcal.errors import Refused
+from triaxcal.model.sensor import Sensor
+from triaxcal_drivers import registers as codec
+from triaxcal_drivers.errors import ProfileError, RegisterValueError
+from triaxcal_drivers.interface import Device
+from triaxcal_drivers.profile import CORRECTED, SCALE_FACTOR_RATIO, Bundle, Profile
+from triaxcald.errors import InputError
+from triaxcald.provision.identity import read_serial
+
+# What is to be written: a calibration's coefficients as raw register words. No I/O.
+
+CRC_ROLE, DATE_ROLE, REFERENCE_ROLE = "calibration_crc", "calibration_date", "reference_temperature"
+NOT_CALIBRATION = ("serial_number", "write_counter")
+
+
+@dataclass(frozen=True)
+class Word:
+    """One register of an image. ``value`` is wanted and ``held`` is what
+    ``raw`` (bytes as on the wire) says, both in the register's ``unit``."""
+
+    register: str
+    role: str
+    raw: bytes
+    value: float
+    held: float
+    unit: str
+    step: float
+    """How far apart the values are that the register can hold there."""
+
+    @property
+    def cost(self) -> float:
+        """What the register's format changes: held − value, in ``unit``."""
+        return self.held - self.value
+
+
+@dataclass(frozen=True)
+class RegisterImage:
+    """The words in the profile's order, the checksum last; ``not_held`` are
+    roles with no register to take them."""
+
+    words: tuple[Word, ...]
+    not_held: tuple[str, ...]
+
+    @property
+    def raw(self) -> dict[str, bytes]:
+        return {word.register: word.raw for word in self.words}
+
+
+def calibration_registers(profile: Profile) -> tuple[str, ...]:
+    """Writable registers with a role in a calibration, in the profile's order,
+    the checksum last."""
+    names = [
+        name for name, r in profile.registers.items() if r.access == "rw" and r.role and r.role not in NOT_CALIBRATION
+    ]
+    last = profile.crc.register_name if profile.crc else profile.by_role(CRC_ROLE)
+    return tuple(sorted(names, key=lambda name: name == last))
+
+
+def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_days: int) -> RegisterImage:
+    """``coefficients`` by role, each in its register's unit, with
+    ``reference_temperature`` among them; ``date_days`` since 1970-01-01.
+
+    A register whose role has no coefficient gets 0: the calibration does not
+    have that effect. Raises RegisterValueError for a value that does not fit,
+    InputError where a scale factor (or the reference temperature of temperature
+    effects) is missing, ProfileError where the checksum covers other registers.
+    """
+    names = calibration_registers(profile)
+    wanted = {**coefficients, DATE_ROLE: float(date_days)}
+    roles = {profile.registers[name].role for name in names}
+    _refuse_gaps(roles, coefficients)
+    checksum = profile.crc.register_name if profile.crc else None
+    words = [_word(profile, name, wanted.get(profile.registers[name].role, 0.0)) for name in names if name != checksum]
+    if checksum:
+        value = checksum_of(profile, {word.register: word.raw for word in words})
+        words.append(_word(profile, checksum, value))
+    return RegisterImage(tuple(words), tuple(role for role in coefficients if role not in roles))
+
+
+def image_of(profile: Profile, raw: Mapping[str, bytes]) -> RegisterImage:
+    """The image whose raw bytes are known. Raises ProfileError for a register
+    that the profile has not."""
+    words = []
+    for name, data in raw.items():
+        if name not in profile.registers:
+            raise ProfileError(f"profile {profile.name}: no register named '{name}'")
+        register, value = profile.registers[name], profile.decode(name, data)
+        words.append(Word(name, register.role or "", data, value, value, register.unit, codec.step(register, value)))
+    return RegisterImage(tuple(words), ())
+
+
+def _refuse_gaps(roles: set[str], coefficients: Mapping[str, float]) -> None:
+    """Zero is a fair value for an effect that is absent, but not for these."""
+    missing = [role for role in sorted(roles) if role.startswith("scale_factor.") and role not in coefficients]
+    thermal = [role for role, value in coefficients.items() if role.startswith("temperature_") and value]
+    if thermal and REFERENCE_ROLE in roles and REFERENCE_ROLE not in coefficients:
+        missing.append(f"{REFERENCE_ROLE} (of {thermal[0]})")
+    if missing:
+        raise InputError(f"calibration: no {', '.join(missing)}, which the device needs")
+
+
+def _word(profile: Profile, name: str, value: float) -> Word:
+    register = profile.registers[name]
+    raw = profile.encode(name, value)
+    return Word(name, register.role, raw, value, profile.decode(name, raw), register.unit, codec.step(register, value))
+
+
+def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
+    """The profile's checksum over registers' raw bytes (as on the wire), by
+    name.
+
+    Raises ProfileError where it covers a register that is not given,
+    RegisterValueError where one holds no number or has a wrong length.
+    """
+    if profile.crc is None:
+        raise ProfileError(f"profile {profile.name}: crc: none is described")
+    for name in profile.crc.over:
+        if name not in raw:
+            raise ProfileError(
+                f"profile {profile.name}: crc: covers register {name}, which is no writable register with a role"
+            )
+        if not math.isfinite(profile.decode(name, raw[name])):
+            raise RegisterValueError(f"register {name}: {raw[name].hex()} is no number")
+    covered = b"".join(profile.most_significant_first(raw[name]) for name in profile.crc.over)
+    return codec.crc(profile.crc.algorithm, covered)
+
+
+# What the device holds: its calibration registers as raw bytes.
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Raw bytes as on the wire by register, in the order in which they are to
+    be written, and whose they are (None where the profile has no serial
+    number)."""
+
+    raw: Mapping[str, bytes]
+    serial: str | None = None
+
+    def differing(self, other: Mapping[str, bytes]) -> tuple[str, ...]:
+        """The registers in which ``other`` differs, in this snapshot's order."""
+        return tuple(name for name, raw in self.raw.items() if name in other and other[name] != raw)
+
+
+async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | None = None) -> Snapshot:
+    """Read ``names``, by default every calibration register. Raises
+    RegisterRefused, DeviceSilent."""
+    serial = await read_serial(device, bundle)
+    names = calibration_registers(bundle.profile) if names is None else names
+    return Snapshot({name: await device.read(name) for name in names}, serial)
+
+
+# Is what the device holds a calibration at all? Values alone, no I/O.
+
+Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
+
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "misalignment": (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
+    "bias": (-20.0, 20.0),  # g: the full scale of the triads in question
+    REFERENCE_ROLE: (-273.15, 1000.0),  # °C
+    DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
+}
+EFFECT_BOUND = 10.0
+"""g per g², per K and so on: an effect as large as this would leave nothing of
+the measurement."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why a snapshot is hardly a calibration. ``low`` and ``high`` bound what
+    was expected of ``value``."""
+
+    kind: Kind
+    register: str
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+
+def is_blank(snapshot: Snapshot) -> bool:
+    """Never written: every byte 0xFF, or every byte 0x00."""
+    held = b"".join(snapshot.raw.values())
+    return bool(held) and len(set(held)) == 1 and held[0] in (0x00, 0xFF)
+
+
+def unstable(profile: Profile, first: Snapshot, second: Snapshot) -> list[Doubt]:
+    """Registers that two readings in a row do not agree on."""
+    return [Doubt("unstable", name, profile.decode(name, second.raw[name])) for name in first.differing(second.raw)]
+
+
+def doubts(profile: Profile, snapshot: Snapshot, image: RegisterImage) -> list[Doubt]:
+    """None for a blank device, and none for what looks like a calibration."""
+    if is_blank(snapshot):
+        return []
+    wanted = {word.register: word.value for word in image.words}
+    found = [doubt for name, raw in snapshot.raw.items() if (doubt := _of(profile, name, raw, wanted))]
+    return [*found, *_checksum(profile, snapshot)]
+
+
+def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) -> Doubt | None:
+    value = profile.decode(name, raw)
+    if not math.isfinite(value):
+        return Doubt("not_a_number", name, value)
+    register = profile.registers[name]
+    low = -math.inf if register.minimum is None else register.minimum
+    high = math.inf if register.maximum is None else register.maximum
+    if not low <= value <= high:
+        return Doubt("outside_limits", name, value, low, high)
+    quantity, _, axis = (register.role or "").partition(".")
+    if quantity == "scale_factor":
+        nominal = profile.output.nominal_scale_factor
+        size = abs(nominal["xyz".index(axis)] if nominal else wanted.get(name, math.nan))
+        low, high = size / SCALE_FACTOR_RATIO, size * SCALE_FACTOR_RATIO
+        implausible = abs(value) < low or abs(value) > high
+    else:
+        low, high = BOUNDS.get(quantity, (-EFFECT_BOUND, EFFECT_BOUND))
+        implausible = quantity != CRC_ROLE and not low <= value <= high
+    return Doubt("implausible", name, value, low, high) if implausible else None
+
+
+def fits_its_checksum(profile: Profile, snapshot: Snapshot) -> bool:
+    """Whether the device has a checksum, and holds the one that belongs to its
+    registers."""
+    return profile.crc is not None and not _checksum(profile, snapshot)
+
+
+def _checksum(profile: Profile, snapshot: Snapshot) -> Sequence[Doubt]:
+    if profile.crc is None or profile.crc.register_name not in snapshot.raw:
+        return []
+    name = profile.crc.register_name
+    held = profile.decode(name, snapshot.raw[name])
+    try:
+        right = float(checksum_of(profile, snapshot.raw))
+    except (RegisterValueError, ProfileError, OverflowError, ValueError):  # a register holds no number
+        right = math.nan
+    return [] if held == right else [Doubt("checksum", name, held, right, right)]
+
+
+# Does a device's corrected output follow its own registers? Values alone, no I/O.
+
+TOLERANCE_G = 0.01
+"""Wrong word order, axes, signs or conventions make errors of the size of the
+bias at least; rounding, and an order of correction other than ours, make ones
+of the size of a product of two small coefficients."""
+LEAST = 3
+"""So few samples or poses say nothing."""
+
+
+def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | None:
+    """The sensor that the registers describe, and its reference temperature in
+    °C; None where they describe none."""
+    held = {r.role: profile.decode(n, snapshot.raw[n]) for n, r in profile.registers.items() if n in snapshot.raw}
+    linear = [[held.get(f"{name}.{axis}") for axis in "xyz"] for name in ("scale_factor", "misalignment", "bias")]
+    if any(value is None or not np.isfinite(value) for values in linear for value in values):
+        return None
+    scale_factor, misalignment, bias = (np.array(values, dtype=float) for values in linear)
+    if not scale_factor.all():
+        return None
+    effects: dict[str, dict[str, float]] = {}
+    for role, value in held.items():
+        name, dot, coefficient = (role or "").partition(".")
+        if dot and name not in ("scale_factor", "misalignment", "bias"):
+            effects.setdefault(name, {})[coefficient] = value
+    found = [effect_of(name, values) for name, values in effects.items() if any(values.values())]
+    return Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(REFERENCE_ROLE, 0.0)
+
+
+def departure_g(
+    profile: Profile, snapshot: Snapshot, readings: Floats, corrected: Floats, channels: Mapping[str, Floats]
+) -> float | None:
+    """Median distance in g of the ``corrected`` output (n,3) from what the
+    registers make of the ``readings`` (n,3) of the same moments; ``channels``
+    (n,) each. None where that cannot be told."""
+    if len(readings) < LEAST or (described := sensor_in(profile, snapshot)) is None:
+        return None
+    sensor, reference_c = described
+    covariates = {"temp_c": channels["temp_c"] - reference_c} if "temp_c" in channels else {}
+    if any(need not in covariates for effect, _ in sensor.effects for need in effect.needs):
+        return None
+    try:
+        expected = sensor.specific_force(readings, covariates)
+    except Refused:
+        return None
+    return float(np.median(np.linalg.norm(corrected - expected, axis=1)))
+
+
+def doubt_of_departure(off_g: float | None) -> list[Doubt]:
+    if off_g is None or off_g <= TOLERANCE_G:
+        return []
+    return [Doubt("corrected_output", "", off_g, 0.0, TOLERANCE_G)]
+
+
+# May the readings be corrected already, by the registers that are to be written?
+
+NAMED = 3
+"""So many registers tell enough."""
+
+
+class ReadingsNotStated(Refused):
+    """The readings may be corrected already, and the profile does not say.
+    Raised before anything is written."""
+
+
+def leaves_open(profile: Profile) -> bool:
+    """Whether the profile does not say if the readings are those before the
+    device's correction: by a second stream for the corrected ones, or by
+    ``correction.readings``."""
+    stated = profile.correction is not None and profile.correction.readings is not None
+    return CORRECTED not in profile.streams and not stated and bool(_correcting(profile))
+
+
+def require_readings_before(profile: Profile, snapshot: Snapshot) -> None:
+    """Raises ReadingsNotStated where the profile leaves open whether the readings are
+    corrected, and registers of the ``snapshot`` would correct them."""
+    if not leaves_open(profile) or not (names := not_neutral(profile, snapshot)):
+        return
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    raise ReadingsNotStated(
+        f"the device holds a calibration ({', '.join(names[:NAMED])}{more}), and the profile {profile.name} does not "
+        "say whether its readings are corrected by it already, in which case a new one would replace it wrongly: "
+        'where they are not, write [correction] readings = "before" in the profile; nothing was written'
+    )
+
+
+def not_neutral(profile: Profile, snapshot: Snapshot) -> tuple[str, ...]:
+    """The registers of ``snapshot`` by which the device would change its
+    readings; none of a blank device."""
+    held = {name: snapshot.raw[name] for name in _correcting(profile) if name in snapshot.raw}
+    if is_blank(Snapshot(held)):
+        return ()
+    return tuple(name for name, raw in held.items() if not _is_neutral(profile, name, raw))
+
+
+def _correcting(profile: Profile) -> tuple[str, ...]:
+    """The calibration registers that change readings by themselves."""
+    labels = (CRC_ROLE, DATE_ROLE, REFERENCE_ROLE)
+    return tuple(name for name in calibration_registers(profile) if profile.registers[name].role not in labels)
+
+
+def _is_neutral(profile: Profile, name: str, raw: bytes) -> bool:
+    register, value = profile.registers[name], profile.decode(name, raw)
+    quantity, _, axis = (register.role or "").partition(".")
+    if quantity != "scale_factor":
+        return value == _nearest(profile, name, 0.0)
+    # The device divides by it. Who wrote the nominal one may have rounded it
+    # otherwise, by a step of the register at most.
+    nominal = profile.output.nominal_scale_factor
+    neutral = [1.0, *([nominal["xyz".index(axis)]] if nominal else [])]
+    return any(abs(value - _nearest(profile, name, n)) <= codec.step(register, n) * (1 + 1e-9) for n in neutral)
+
+
+def _nearest(profile: Profile, name: str, value: float) -> float:
+    """What the register holds for ``value``, which its format may not have."""
+    try:
+        return profile.decode(name, profile.encode(name, value))
+    except RegisterValueError:  # outside its limits
+        return value
