@@ -3,17 +3,112 @@ it, and its files are read."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.errors import DriverMissing, ProfileError
 from triaxcal_drivers.files import inside, read_whole, size
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.nearest import clipped, closest
 from triaxcal_drivers.profile import Bundle
-from triaxcal_drivers.toml_text import PROFILE, parse_toml, read_toml
-from triaxcal_drivers.validation import validate
+from triaxcal_drivers.validation import PROFILE, parse_toml, read_toml, validate
+
+if TYPE_CHECKING:
+    from triaxcal_drivers.interface import Driver
+
+
+# Packages that a bare install lacks, and which extra of it brings them.
+
+EXTRAS = {
+    "can": "can",
+    "canopen": "can",
+    "pymodbus": "modbus",
+    "serial": "modbus",
+    "msgpack": "station",
+    "asammdf": "logs",
+    "rosbags": "logs",
+    "lz4": "logs",
+}
+"""By the name that is imported."""
+CALLED = {"can": "python-can", "serial": "pyserial"}
+"""Where the package has another name than what is imported."""
+
+
+def absent(modules: Iterable[str]) -> str | None:
+    """What to install, of modules by the names that are imported; None where
+    all are there."""
+    missing = [m for m in modules if importlib.util.find_spec(m) is None]
+    if not missing:
+        return None
+    ours = [m for m in missing if m in EXTRAS]
+    extras = {EXTRAS[m] for m in ours}
+    return _told((ours or missing)[0], extras.pop() if len(extras) == 1 else "station" if extras else None)
+
+
+def lacking(e: ModuleNotFoundError) -> str | None:
+    """What to install; None where it is no package of ours."""
+    module = (e.name or "").partition(".")[0]
+    return _told(module, EXTRAS[module]) if module in EXTRAS else None
+
+
+def _told(module: str, extra: str | None) -> str:
+    brings = f"; pip install 'triaxcal[{extra}]' brings it" if extra else ""
+    return f"the package {CALLED.get(module, module)} is not installed{brings}"
+
+
+# The drivers that are installed, found by entry point; none is imported until asked
+# for.
+
+GROUP = "triaxcal.drivers"
+
+
+@dataclass(frozen=True)
+class Listed:
+    """An installed driver; ``fault`` says why it cannot be used, where it
+    cannot."""
+
+    name: str
+    target: str
+    distribution: str
+    fault: str | None = None
+
+
+def _points() -> dict[str, EntryPoint]:
+    return {p.name: p for p in entry_points(group=GROUP)}
+
+
+def driver_named(name: str, *, where: str = "") -> Driver:
+    """Raises DriverMissing with the nearest name, or with the reason why it
+    cannot be imported."""
+    lead = f"{where}: " if where else ""
+    points = _points()
+    if name not in points:
+        close = closest(name, points)
+        hint = f"; did you mean '{close}'?" if close else f"; installed: {', '.join(sorted(points)) or 'none'}"
+        raise DriverMissing(f"{lead}no driver named '{clipped(name)}'{hint}")
+    try:
+        return cast("Driver", points[name].load()())
+    except Exception as e:
+        why = (lacking(e) if isinstance(e, ModuleNotFoundError) else None) or repr(e)
+        raise DriverMissing(f"{lead}driver '{name}' ({points[name].value}) cannot be loaded: {why}") from e
+
+
+def listed() -> list[Listed]:
+    """Every installed driver, tried; for `triaxcal devices`."""
+    found = []
+    for name, point in sorted(_points().items()):
+        fault = None
+        try:
+            fault = absent(getattr(driver_named(name), "packages", ()))
+        except DriverMissing as e:
+            fault = str(e)
+        found.append(Listed(name, point.value, point.dist.name if point.dist else "?", fault))
+    return found
+
 
 BUILT_IN = Path(__file__).parent / "profiles"
 FILE_MOST = 16 * 2**20

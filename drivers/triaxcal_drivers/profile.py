@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, field_validator, mo
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.nearest import nearest
-from triaxcal_drivers.register_types import RawType
+from triaxcal_drivers.registers import RawType
 
 AXES = ("x", "y", "z")
 READINGS, CORRECTED = "readings", "corrected"

@@ -9,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from triaxcal_drivers.file_kind import document_kind, kind, special_kind
+from triaxcal_drivers.files import document_kind, kind, special_kind
 
 
 def _zipped() -> bytes:

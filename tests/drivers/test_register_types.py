@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import Register
-from triaxcal_drivers.register_types import TYPES, in_words, next_in_words
-from triaxcal_drivers.registers import decode, encode, step
+from triaxcal_drivers.registers import TYPES, decode, encode, in_words, next_in_words, step
 
 LITERAL = {
     "int16": (-2, "FFFE"),

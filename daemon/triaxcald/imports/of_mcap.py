@@ -10,12 +10,10 @@ from typing import Any, cast
 
 from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.logs.frames import Account
+from triaxcal_drivers.logs.frames import LONGEST_NS, Account
 from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
-from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
-from triaxcal_drivers.mcap.driver import stream_reader
-from triaxcal_drivers.mcap.model import McapProfile, schema_file
+from triaxcal_drivers.mcap.driver import McapProfile, schema_file, stream_reader
 from triaxcal_drivers.mcap.schema import MessageSchema
 from triaxcal_drivers.nearest import clipped, nearest
 from triaxcal_drivers.profile import READINGS, Bundle

@@ -10,9 +10,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
-from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, ExtraAnswer, RawBatch
 from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.errors import DaemonError, TwoAnswer
 

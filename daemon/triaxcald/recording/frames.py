@@ -38,8 +38,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from triaxcal_drivers.file_kind import HEAD as HEAD_LOOKED_AT
-from triaxcal_drivers.file_kind import kind
+from triaxcal_drivers.files import HEAD as HEAD_LOOKED_AT
+from triaxcal_drivers.files import kind
 from triaxcald.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"

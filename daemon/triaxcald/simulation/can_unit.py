@@ -18,8 +18,8 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.bus import opened
-from triaxcal_drivers.can.description import object_dictionary
+from triaxcal_drivers.can.layout import object_dictionary
+from triaxcal_drivers.can.line import opened
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.can.python_can import open_python_can
 from triaxcal_drivers.errors import BusError

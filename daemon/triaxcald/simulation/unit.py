@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.files import read_whole
-from triaxcal_drivers.register_types import TYPES
-from triaxcal_drivers.registers import crc
+from triaxcal_drivers.registers import TYPES, crc
 from triaxcald.abort import at_abort
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable, write_bytes

@@ -18,7 +18,7 @@ from triaxcald.errors import InputError
 from triaxcald.station.coming_back import Patience, claimed, until_open
 
 if TYPE_CHECKING:
-    from triaxcal_drivers.can.listener import BusListener
+    from triaxcal_drivers.can.line import BusListener
 
 BUSES_MOST = 32  # more adapters than a machine has ports for
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"  # of files too
@@ -44,7 +44,7 @@ class BusPlace:
         return ", ".join(f"{k}={v}" for k, v in self.given.items())
 
     def listener(self) -> BusListener:
-        from triaxcal_drivers.can.listener import BusListener  # python-can, which other stations do without
+        from triaxcal_drivers.can.line import BusListener  # python-can, which other stations do without
 
         return BusListener(self.settings)
 

@@ -18,7 +18,7 @@ from triaxcald.station.coming_back import Patience, until_open
 from triaxcald.station.raw_records import RawRecords
 
 if TYPE_CHECKING:
-    from triaxcal_drivers.can.listener import BusListener
+    from triaxcal_drivers.can.line import BusListener
 
 SETTLED_S = 1.0
 """A bus is back where it brings a frame, or does not fail for so long."""

@@ -15,7 +15,6 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from triaxcal_drivers.answers import Answers, ExtraAnswer
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
@@ -31,7 +30,7 @@ from triaxcal_drivers.errors import (
     ProfileError,
     RegisterRefused,
 )
-from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, RawBatch, RawFlag
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Answers, ExtraAnswer, RawBatch, RawFlag
 from triaxcal_drivers.nearest import nearest
 
 T = TypeVar("T")

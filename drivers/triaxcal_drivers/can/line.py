@@ -3,25 +3,68 @@ listens to all of it.
 
 Most adapters can be opened once, and a socket for each unit would hand every
 frame of the bus to each of them. So the units share one `CanLine`: one thread
-receives, and passes each frame to those who listen to its identifier.
-"""
+receives, and passes each frame to those who listen to its identifier."""
 
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Adapter, Frame, Identifier
-from triaxcal_drivers.can.bus import open_bus, opened
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.can.receive import FrameQueue
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
+
+# Opening a CAN bus, which blocks.
+
+T = TypeVar("T")
+
+
+def open_bus(settings: BusSettings) -> Adapter:
+    """Blocking; SocketCAN and multicast by sockets of our own, all else by
+    python-can.
+    Raises BusError."""
+    if settings.interface == "socketcan" and sys.platform == "linux":
+        from triaxcal_drivers.can.socketcan import open_socketcan  # what it imports is Linux' own
+
+        return open_socketcan(str(settings.channel), settings.options, settings.bitrate)
+    if settings.interface == "udp_multicast" and sys.platform == "linux" and find_spec("msgpack"):
+        from triaxcal_drivers.can.udp_multicast import OPTIONS, UdpMulticast
+
+        if OPTIONS.issuperset(settings.options):
+            return UdpMulticast(settings)
+    from triaxcal_drivers.can.python_can import PythonCan  # python-can takes a tenth of a second to load
+
+    return PythonCan(settings)
+
+
+async def opened(opening: Callable[[], T], closing: Callable[[T], object]) -> T:
+    """What ``opening`` gives, called in a thread, which closes it again where
+    nobody waits for it any more. Raises what ``opening`` does."""
+    given_up = threading.Event()
+
+    def open_unless_given_up() -> T:
+        made = opening()
+        if given_up.is_set():
+            closing(made)
+        return made
+
+    try:
+        return await asyncio.to_thread(open_unless_given_up)
+    except asyncio.CancelledError:
+        given_up.set()
+        raise
+
 
 _SENT, _EXTENDED, _NO_DATA = int(RawFlag.SENT), int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR | RawFlag.REMOTE)
 
@@ -206,3 +249,88 @@ async def leave(line: CanLine) -> None:
         for name in [name for name, known in lines.items() if known is line]:
             del lines[name]
         await line.close()
+
+
+# All frames of a CAN bus, whosever they are.
+
+LOOK_S = 0.2
+"""A quiet bus is told of so often: who counts seconds is no later by more."""
+CAPACITY = 1 << 17
+"""Frames that wait for the event loop: over ten seconds of a full bus at
+1 Mbit/s, as in the receive buffer before them."""
+REOPENED = f"the adapter was closed and opened anew, as nobody was heard for {MUTE_S:g} s"
+
+
+@dataclass(frozen=True)
+class _Connection:
+    line: CanLine
+    frames: FrameQueue
+    openings: int  # of the line, by then
+
+
+class BusListener:
+    """Listens to a bus, which it may share with units of this process, and
+    sends nothing.
+
+    Nobody has to send on a bus: silence is no fault of it. Frames that this
+    program sends are among those that it gives, with RawFlag.SENT.
+    """
+
+    def __init__(self, settings: BusSettings) -> None:
+        self._settings = settings
+        self._connection: _Connection | None = None
+        self._first: RawBatch | None = None  # which `settled` has seen
+
+    async def open(self) -> None:
+        """What comes from now on is given. Raises BusError."""
+        await self.close()
+        line = await join(self._settings)
+        frames = FrameQueue(line.attention, capacity=CAPACITY)
+        frames.open(None)
+        self._connection = _Connection(line, frames, line.openings)
+        line.hear(frames)
+
+    async def close(self) -> None:
+        connection, self._connection, self._first = self._connection, None, None
+        if connection is not None:
+            connection.line.unhear(connection.frames)
+            connection.frames.fail(BusError(f"{self._settings} is closed"))
+            await leave(connection.line)
+
+    def _connected(self) -> _Connection:
+        if self._connection is None:
+            raise BusError(f"{self._settings} is not open")
+        return self._connection
+
+    async def settled(self, timeout_s: float) -> None:
+        """Waits for a frame, or for so long without a failure: an adapter may
+        open and fail at once. Raises BusError."""
+        self._first = await self._connected().frames.batch(timeout_s)
+
+    async def stream(self) -> AsyncGenerator[RawBatch, None]:
+        """All frames and error frames since it was opened, until the iterator is
+        closed; where none come, a batch without any every `LOOK_S`.
+
+        Raises BusError.
+        """
+        connection = self._connected()
+        line, frames = connection.line, connection.frames
+        openings, last_ns = connection.openings, None
+        while True:
+            batch, self._first = self._first, None
+            if batch is None:
+                batch = await frames.batch(LOOK_S)
+            if batch is None:
+                now_ns, look = HOST.now_ns(), RawBatch.of([])
+                if line.openings != openings:
+                    look = look.after(Gap(now_ns if last_ns is None else last_ns, now_ns, REOPENED))
+                openings, last_ns = line.openings, now_ns
+                yield look
+                continue
+            if not batch:
+                continue
+            if line.openings != openings and batch.gap is None:
+                first_ns = int(batch.time_ns[0])
+                batch = batch.after(Gap(first_ns if last_ns is None else last_ns, first_ns, REOPENED))
+            openings, last_ns = line.openings, int(batch.time_ns[-1])
+            yield batch

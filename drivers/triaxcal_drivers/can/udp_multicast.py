@@ -23,9 +23,7 @@ import msgpack
 
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.model import BusSettings
-from triaxcal_drivers.can.raw_frame import FD_LENGTHS
-from triaxcal_drivers.can.raw_socket import BUFFER_BY_FORCE, DROPS, STAMPS, STAMPS_OLD
-from triaxcal_drivers.can.reception import Reception
+from triaxcal_drivers.can.socketcan import BUFFER_BY_FORCE, DROPS, FD_LENGTHS, STAMPS, STAMPS_OLD, Reception
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag
 

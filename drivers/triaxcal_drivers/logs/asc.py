@@ -26,8 +26,11 @@ from triaxcal_drivers.logs.frames import (
     Account,
     LoggedFrame,
     Remark,
+    date_ns,
+    nanoseconds,
+    numbered,
+    whole,
 )
-from triaxcal_drivers.logs.lines import date_ns, nanoseconds, numbered, whole
 
 HEAD = re.compile(rb"(?:date\s+\w+\s+\w+|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version\s+\d)", re.I)
 _DATE = re.compile(rb"(?:date|begin\s+triggerblock)\s+(.*)", re.I)

@@ -26,8 +26,8 @@ from triaxcal_drivers.logs.frames import (
     Account,
     LoggedFrame,
     Remark,
+    utc_ns,
 )
-from triaxcal_drivers.logs.times import utc_ns
 
 MAGIC = b"LOGG"
 OBJECT_MOST = 16 * 2**20

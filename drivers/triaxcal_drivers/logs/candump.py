@@ -23,10 +23,13 @@ from triaxcal_drivers.logs.frames import (
     SWITCHED,
     Account,
     LoggedFrame,
+    Placed,
     Remark,
+    nanoseconds,
+    numbered,
+    timed,
+    utc_ns,
 )
-from triaxcal_drivers.logs.lines import nanoseconds, numbered
-from triaxcal_drivers.logs.times import Placed, timed, utc_ns
 
 LOG = re.compile(
     rb"\((\d{1,12})\.(\d{1,9})\)\s+(\S{1,64})\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"

@@ -29,6 +29,7 @@ from triaxcal_drivers.logs.frames import (
     EXTENDED_MOST,
     FD,
     FD_MOST,
+    LONGEST_NS,
     REMOTE,
     SENT,
     SWITCHED,
@@ -36,7 +37,6 @@ from triaxcal_drivers.logs.frames import (
     LoggedFrame,
     Remark,
 )
-from triaxcal_drivers.logs.times import LONGEST_NS
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
 RECORDS_AT_ONCE = 8192

@@ -26,8 +26,9 @@ from triaxcal_drivers.logs.frames import (
     SWITCHED,
     Account,
     LoggedFrame,
+    Placed,
+    timed,
 )
-from triaxcal_drivers.logs.times import Placed, timed
 
 PACKET_MOST = 2**20  # bytes of a packet or a block; tcpdump keeps 256 KiB of one
 INTERFACES_MOST = 1000

@@ -19,6 +19,7 @@ from triaxcal_drivers.logs.frames import (
     FD,
     FD_LENGTHS,
     FD_MOST,
+    LONGEST_NS,
     REMOTE,
     SENT,
     STANDARD_MOST,
@@ -26,9 +27,9 @@ from triaxcal_drivers.logs.frames import (
     Account,
     LoggedFrame,
     Remark,
+    numbered,
+    whole,
 )
-from triaxcal_drivers.logs.lines import numbered, whole
-from triaxcal_drivers.logs.times import LONGEST_NS
 
 LINE = re.compile(rb"\s*\d+\)?\s+\d+(?:\.\d+)?\s+\S+\s+\S+")
 HEAD = re.compile(rb";(?:\$FILEVERSION\s*=|\$STARTTIME\s*=|#{40})")

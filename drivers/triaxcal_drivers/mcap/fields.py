@@ -3,14 +3,155 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.logs.times import LONGEST_NS
-from triaxcal_drivers.mcap.cdr import CdrReader, members
-from triaxcal_drivers.mcap.definitions import message_types
+from triaxcal_drivers.logs.frames import LONGEST_NS
+from triaxcal_drivers.mcap.definitions import Described, Fields, message_types
 from triaxcal_drivers.mcap.schema import DEFINITION_MOST, MessageSchema
+from triaxcal_drivers.nearest import nearest
+
+# Numbers out of CDR, the encoding of ROS 2's messages. No I/O.
+
+_FORMATS = {
+    "bool": "?", "byte": "B", "octet": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+}  # fmt: skip
+_SIZES = {name: struct.calcsize(code) for name, code in _FORMATS.items()}
+_ORDERS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}
+"""By the second byte of a message: byte order, and the largest alignment (plain
+CDR of versions 1 and 2)."""
+DEEPEST = 32  # messages within messages; honest ones have three or four
+
+_Wanted = dict[str, Any]  # by field: the place of its number among those asked for, or what is wanted within
+
+
+class CdrReader:
+    """Reads the fields at ``paths`` of messages ``outermost``. Raises
+    ProfileError where there is no such number."""
+
+    def __init__(self, outermost: str, types: Mapping[str, Fields], paths: Sequence[Sequence[str]], where: str) -> None:
+        self._types, self._outermost = types, outermost
+        self._count = len(paths)
+        self._wanted: _Wanted = {}
+        for place, path in enumerate(paths):
+            _number(types, ("message", outermost), path, where)
+            at = self._wanted
+            for part in path[:-1]:
+                at = at.setdefault(part, {})
+            at[path[-1]] = place
+
+    def read(self, data: bytes) -> list[float]:
+        """Raises ValueError where the message is not as it is defined."""
+        if len(data) < 4 or data[0] != 0 or data[1] not in _ORDERS:
+            raise ValueError("not plain CDR")
+        walk = _Walk(self._types, data[4:], *_ORDERS[data[1]], [0.0] * self._count)
+        try:
+            walk.field(("message", self._outermost), self._wanted, 0)
+        except struct.error as e:
+            raise ValueError("shorter than its definition") from e
+        if walk.left:
+            raise ValueError("shorter than its definition")
+        return walk.found
+
+
+def members(types: Mapping[str, Fields], outermost: str, path: Sequence[str]) -> set[str]:
+    """The fields of the message at ``path``; none where it is no message."""
+    at: Described = ("message", outermost)
+    for part in path:
+        at = dict(types.get(at[1], ())).get(part, ("none", "")) if at[0] == "message" else ("none", "")
+    return {name for name, _ in types.get(at[1], ())} if at[0] == "message" else set()
+
+
+def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], where: str) -> None:
+    for place, part in enumerate(path):
+        kind, detail = at
+        if kind == "message":
+            fields = dict(types.get(detail, ()))
+            if part not in fields:
+                inside = f" in '{'.'.join(path[:place])}'" if place else ""
+                raise ProfileError(f"{where}: no field '{part}'{inside}{nearest(part, fields)}")
+            at = fields[part]
+        elif kind in ("array", "sequence") and part.isdecimal():
+            at = detail[0] if kind == "array" else detail
+            if kind == "array" and int(part) >= detail[1]:
+                raise ProfileError(f"{where}: '{'.'.join(path)}' is beyond the array's {detail[1]} elements")
+        else:
+            raise ProfileError(f"{where}: '{'.'.join(path[:place])}' has no field '{part}'")
+    if at[0] != "base" or at[1] not in _FORMATS:
+        raise ProfileError(f"{where}: '{'.'.join(path)}' is no number")
+
+
+class _Walk:
+    """One way through one message."""
+
+    def __init__(
+        self, types: Mapping[str, Fields], data: bytes, order: str, alignment: int, found: list[float]
+    ) -> None:
+        self._types, self._data, self._order, self._alignment = types, data, order, alignment
+        self._at = 0
+        self.found, self.left = found, len(found)
+
+    def field(self, described: Described, wanted: Any, depth: int) -> None:
+        """``wanted`` is the place of its number, or a dict of what is wanted
+        within; the walk ends where nothing is left to be found."""
+        if not self.left:
+            return
+        if depth > DEEPEST:
+            raise ValueError("nested too deeply")
+        kind, detail = described
+        if kind == "base":
+            self._base(detail, wanted)
+        elif kind == "message":
+            for name, inner in self._types[detail]:
+                self.field(inner, wanted.get(name), depth + 1) if isinstance(wanted, dict) else self.field(
+                    inner, None, depth + 1
+                )
+        else:
+            element, count = detail if kind == "array" else (detail, self._count())
+            self._elements(element, count, wanted if isinstance(wanted, dict) else {}, depth)
+
+    def _base(self, name: str, wanted: Any) -> None:
+        if name in ("string", "wstring"):
+            length = self._count()
+            self._step(length if name == "string" else 2 * length)
+            return
+        size = _SIZES.get(name)
+        if size is None:
+            raise ValueError(f"a field of type {name}")
+        self._align(size)
+        if isinstance(wanted, int):
+            (self.found[wanted],) = struct.unpack_from(self._order + _FORMATS[name], self._data, self._at)
+            self.left -= 1
+        self._step(size)
+
+    def _elements(self, element: Described, count: int, wanted: _Wanted, depth: int) -> None:
+        size = _SIZES.get(element[1]) if element[0] == "base" else None
+        if size and count and not wanted:
+            self._align(size)
+            self._step(count * size)
+            return
+        if count > len(self._data):
+            raise ValueError("a sequence that is longer than the message")
+        for i in range(count):
+            self.field(element, wanted.get(str(i)), depth + 1)
+
+    def _count(self) -> int:
+        self._align(4)
+        (count,) = struct.unpack_from(self._order + "I", self._data, self._at)
+        self._at += 4
+        return int(count)
+
+    def _align(self, size: int) -> None:
+        self._at += -self._at % min(size, self._alignment)
+
+    def _step(self, count: int) -> None:
+        self._at += count
+        if self._at > len(self._data):
+            raise ValueError("shorter than its definition")
+
 
 SECONDS = ("sec", "secs", "seconds")
 NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")

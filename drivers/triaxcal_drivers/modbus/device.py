@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 
-from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import (
     BusError,
     DeviceAbsent,
@@ -20,8 +19,8 @@ from triaxcal_drivers.errors import (
     SecondAnswer,
 )
 from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import RawBatch, RawFlag
-from triaxcal_drivers.modbus.client import ModbusClient
+from triaxcal_drivers.interface import ExtraAnswer, RawBatch, RawFlag
+from triaxcal_drivers.modbus.line import ModbusClient
 from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
 from triaxcal_drivers.modbus.protocol import (
     GATEWAY_CODES,
@@ -32,7 +31,7 @@ from triaxcal_drivers.modbus.protocol import (
     ModbusRefusal,
     Spoiled,
 )
-from triaxcal_drivers.register_types import TYPES
+from triaxcal_drivers.registers import TYPES
 
 _BATCH_REPLIES = 32
 """A stream hands out what it has after so many replies, though more may be

@@ -7,8 +7,7 @@ from typing import Any
 
 from triaxcal_drivers.claim import canonical_port
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.interface import Decoder, Device
-from triaxcal_drivers.load import LineLoad
+from triaxcal_drivers.interface import Decoder, Device, LineLoad
 from triaxcal_drivers.modbus.decoder import ModbusDecoder
 from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
 from triaxcal_drivers.modbus.protocol import SerialLine

@@ -17,7 +17,7 @@ from triaxcal_drivers.modbus.protocol import (
     TcpAddress,
 )
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
-from triaxcal_drivers.register_types import TYPES, WORD, CounterType, TimeType, WordType, in_words, next_in_words
+from triaxcal_drivers.registers import TYPES, WORD, CounterType, TimeType, WordType, in_words, next_in_words
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
 Order = Literal["big", "little"]

@@ -14,8 +14,8 @@ from tests.devices.memory import Electronics
 from tests.devices.place import Place, Trouble
 from tests.devices.profiles import Timing, profile_text
 from tests.devices.table import NEW, OLD
-from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError, RegisterRefused
+from triaxcal_drivers.interface import ExtraAnswer
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import DaemonError

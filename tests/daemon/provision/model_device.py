@@ -12,8 +12,8 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import DeviceSilent, RegisterRefused
+from triaxcal_drivers.interface import ExtraAnswer
 from triaxcal_drivers.profile import Bundle, Profile, Register
 from triaxcald.provision.access import Pace
 

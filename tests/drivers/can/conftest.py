@@ -9,7 +9,7 @@ import pytest
 from tests.drivers.can.played import Played
 from triaxcal_drivers.can import line as can_line
 from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.layout import stream_layout
 from triaxcal_drivers.can.model import BusSettings, DbcStream, PdoStream
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import BUILT_IN, load_bundle, parse_bundle

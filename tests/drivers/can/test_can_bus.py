@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from triaxcal_drivers.can.bus import opened
+from triaxcal_drivers.can.line import opened
 
 
 async def test_a_bus_that_was_given_up_while_it_opened_is_closed() -> None:

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from triaxcal_drivers.can.error_frame import ControllerState
-from triaxcal_drivers.can.link import Link, link_of, read_link
+from triaxcal_drivers.can.receive import ControllerState
+from triaxcal_drivers.can.socketcan import Link, link_of, read_link
 
 pytestmark = pytest.mark.skipif(sys.byteorder != "little", reason="the bytes are of a little-endian machine")
 

@@ -13,8 +13,7 @@ from triaxcal_drivers.can import line as can_line
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
-from triaxcal_drivers.can.line import MUTE_S, CanLine, join, leave
-from triaxcal_drivers.can.listener import REOPENED, BusListener
+from triaxcal_drivers.can.line import MUTE_S, REOPENED, BusListener, CanLine, join, leave
 from triaxcal_drivers.can.model import BusSettings, CanBus
 from triaxcal_drivers.can.receive import OVERFLOW
 from triaxcal_drivers.errors import BusError

@@ -8,8 +8,7 @@ import sys
 import pytest
 
 from triaxcal_drivers.can.adapter import Frame
-from triaxcal_drivers.can.raw_frame import bytes_of, filters_of
-from triaxcal_drivers.can.reception import Reception
+from triaxcal_drivers.can.socketcan import Reception, bytes_of, filters_of
 from triaxcal_drivers.interface import RawFlag
 
 pytestmark = pytest.mark.skipif(sys.byteorder != "little", reason="the bytes are of a little-endian machine")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from triaxcal_drivers.can import raw_socket
+from triaxcal_drivers.can import socketcan as raw_socket
 from triaxcal_drivers.can.model import CanBus, SocketCanOptions
 from triaxcal_drivers.can.socketcan import AT_ONCE, SocketCan, open_socketcan
 from triaxcal_drivers.errors import BusError

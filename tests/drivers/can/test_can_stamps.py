@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from triaxcal_drivers.can.stamps import HardwareClock
+from triaxcal_drivers.can.socketcan import HardwareClock
 
 MS, S = 1_000_000, 1_000_000_000
 

@@ -10,7 +10,7 @@ import can
 import msgpack
 import pytest
 
-from triaxcal_drivers.can.bus import open_bus
+from triaxcal_drivers.can.line import open_bus
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.can.python_can import PythonCan
 from triaxcal_drivers.can.udp_multicast import DATAGRAM_BYTES, UdpMulticast

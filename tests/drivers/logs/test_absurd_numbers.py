@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.logs import asc, blf, candump, pcap, trc
-from triaxcal_drivers.logs.frames import EXTENDED_MOST, FD_MOST, LoggedFrame, Remark
-from triaxcal_drivers.logs.lines import date_ns, whole
+from triaxcal_drivers.logs.frames import EXTENDED_MOST, FD_MOST, LONGEST_NS, LoggedFrame, Remark, date_ns, utc_ns, whole
 from triaxcal_drivers.logs.mf4 import _times_ns
-from triaxcal_drivers.logs.times import LONGEST_NS, utc_ns
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 ASC = b"""date Wed Nov 25 04:38:43.000 pm 2026

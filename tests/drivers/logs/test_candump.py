@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs import times
+from triaxcal_drivers.logs import frames as times
 from triaxcal_drivers.logs.candump import frames
 from triaxcal_drivers.logs.frames import LoggedFrame, Remark
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.mcap.decode import MessageDecoder
+from triaxcal_drivers.mcap.driver import MessageDecoder, MessageStream
 from triaxcal_drivers.mcap.fields import Read, reader
-from triaxcal_drivers.mcap.model import MessageStream
 from triaxcal_drivers.mcap.schema import MessageSchema
 
 STREAM = MessageStream.model_validate(

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.mcap.cdr import DEEPEST, CdrReader
 from triaxcal_drivers.mcap.definitions import Fields, message_types
+from triaxcal_drivers.mcap.fields import DEEPEST, CdrReader
 
 rosbags = pytest.importorskip("rosbags.typesys")
 

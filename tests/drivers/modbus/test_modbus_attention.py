@@ -12,8 +12,8 @@ import pytest
 from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.attention import TICK_S
 from triaxcal_drivers.errors import BusError, DeviceSilent
-from triaxcal_drivers.modbus.client import ModbusClient
 from triaxcal_drivers.modbus.device import ModbusDevice
+from triaxcal_drivers.modbus.line import ModbusClient
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import READ_HOLDING, TcpAddress
 
