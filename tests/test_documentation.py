@@ -114,6 +114,36 @@ def test_every_page_is_reached_from_the_index() -> None:
     assert {name_of(p) for p in PAGES if p.is_relative_to(PROJECT / "docs")} <= {name_of(p) for p in reached}
 
 
+TOP = {p.name for p in PROJECT.iterdir()}
+LEFT_BEHIND = [
+    line.strip("/") for line in (PROJECT / ".gitignore").read_text("utf-8").splitlines() if line.startswith("/")
+]
+"""What commands of the documentation write: named in the prose, and not in the repository."""
+
+
+def paths_named(text: str) -> set[str]:
+    """The paths of the repository in backticks, outside fenced blocks."""
+    named = re.findall(r"`([\w.*-]+(?:/[\w.*-]*)+)(?:::\w+)?`", FENCE.sub("", text))
+    return {path for path in named if path.partition("/")[0] in TOP}
+
+
+def is_there(path: str) -> bool:
+    made = any(path.rstrip("/") == left or path.startswith(f"{left}/") for left in LEFT_BEHIND)
+    return made or any(any(root.glob(path.rstrip("/"))) for root in (PROJECT, PROJECT / "tests"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_path_named_in_the_documentation_is_in_the_repository(page: Path) -> None:
+    assert sorted(path for path in paths_named(page.read_text("utf-8")) if not is_there(path)) == []
+
+
+def test_a_path_that_is_not_in_the_repository_would_be_noticed() -> None:
+    text = "See `tests/nowhere.py::test_x`, `docs/*.md`, `g/g`, `~/x` and\n```text\n`docs/none`\n```\n"
+    assert paths_named(text) == {"tests/nowhere.py", "docs/*.md"}
+    assert is_there("docs/*.md")
+    assert not is_there("tests/nowhere.py")
+
+
 # Commands
 
 
@@ -156,20 +186,49 @@ RUNNABLE = [page for page in PAGES if any(b.note.startswith("run") for b in bloc
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE, ids=name_of)
 def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """Commands and Python in order, in one folder; a block marked as output is what the one before it printed."""
     for folder in ("recordings", "examples"):
         shutil.copytree(PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("out", "*.eeprom"))
     monkeypatch.chdir(tmp_path)
-    ran = 0
+    ran, printed = 0, ""
     for block in blocks(page):
         if block.file:
             (tmp_path / block.file).write_text(block.text, "utf-8")
         if block.note.startswith("run"):
-            for command in block.commands:
+            capfd.readouterr()
+            if block.language == "python":
+                exec(compile(block.text, str(page), "exec"), {})
+                ran += 1
+            for command in block.commands if block.language == "console" else ():
                 assert run(command) == int(block.note.partition("exit")[2] or 0), command
                 ran += 1
+            printed = "".join(capfd.readouterr())
+        if block.note == "output":
+            assert not_printed(block.text, printed) == []
     assert ran
+
+
+def not_printed(shown: str, printed: str) -> list[str]:
+    """Of the lines shown, those that were not printed, or not in this order; "..." stands for what is left out, and
+    lines may break elsewhere, as with the width of a terminal."""
+    left, lost = " ".join(printed.split()), []
+    for line in shown.splitlines():
+        for part in filter(None, (" ".join(p.split()) for p in line.split("..."))):
+            _, found, rest = left.partition(part)
+            if found:
+                left = rest
+            else:
+                lost.append(part)
+    return lost
+
+
+def test_output_that_is_not_printed_would_be_noticed() -> None:
+    printed = "one two\nthree four\nfive\n"
+    assert not_printed("one ...\n... four\n...\nfive\n", printed) == []
+    assert not_printed("five\none two\n", printed) == ["one two"]
+    assert not_printed("one 2\n", printed) == ["one 2"]
 
 
 def run(command: str) -> int:
@@ -492,11 +551,18 @@ def test_the_table_of_measured_recordings_is_there() -> None:
     assert len(rows) == len(set(rows)) >= 28
 
 
+README = (PROJECT / "README.md").read_text("utf-8")
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.split()) <= 650
+
+
 def test_the_readme_tells_the_share_that_the_benchmark_measured() -> None:
-    told = re.search(r"named or listed the truth in ([\d.]+) %", (PROJECT / "README.md").read_text("utf-8"))
-    page = (PROJECT / "docs/explanation/undeclared-effects.md").read_text("utf-8")
-    measured = re.search(r"^\| s = 20 to 200: .*?\| 95 % \| ([\d.]+) %", page, re.MULTILINE)
+    told = re.search(r"named or listed the truth in ([\d.]+) % .*?\[[^\]]*\]\(([^)#]+)", README)
     assert told
+    page = (PROJECT / told[2]).read_text("utf-8")
+    measured = re.search(r"^\| s = 20 to 200: .*?\| 95 % \| ([\d.]+) %", page, re.MULTILINE)
     assert measured
     assert told[1] == measured[1]
 
