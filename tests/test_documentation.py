@@ -317,10 +317,10 @@ def test_the_station_of_an_example_finds_the_unit_of_its_device(kind: str) -> No
 
 
 WITH_TOML = [p for p in PAGES if any(b.language == "toml" and b.text.startswith("format") for b in blocks(p))]
-OTHERS_DRIVER = PROJECT / "docs/how-to/write-a-driver.md"
+OTHERS_DRIVER = PROJECT / "examples/driver"
 
 
-@pytest.mark.parametrize("page", [p for p in WITH_TOML if p != OTHERS_DRIVER], ids=name_of)
+@pytest.mark.parametrize("page", WITH_TOML, ids=name_of)
 def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Path) -> None:
     folder_of(page, tmp_path)
     for block in blocks(page):
@@ -330,9 +330,9 @@ def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_driver_of_the_how_to_is_found_and_decodes(tmp_path: Path) -> None:
+def test_the_driver_of_the_examples_is_found_and_decodes(tmp_path: Path) -> None:
     """Installed as pip would, by its metadata, in a folder of its own."""
-    folder_of(OTHERS_DRIVER, tmp_path)
+    shutil.copytree(OTHERS_DRIVER, tmp_path, dirs_exist_ok=True)
     project = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))["project"]
     info = tmp_path / "acme_lines-1.0.dist-info"
     info.mkdir()
@@ -556,6 +556,17 @@ README = (PROJECT / "README.md").read_text("utf-8")
 
 def test_the_readme_is_short() -> None:
     assert len(README.split()) <= 650
+
+
+FEATURES = re.findall(r"^\* (\*\*It .*)$", README, re.MULTILINE)
+
+
+@pytest.mark.parametrize("feature", FEATURES, ids=lambda f: f.split("**")[1])
+def test_every_figure_of_the_readme_is_on_the_page_that_it_links_to(feature: str) -> None:
+    pages = "".join((PROJECT / t.partition("#")[0]).read_text("utf-8") for t in LINK.findall(feature))
+    figures = re.findall(r"(?<![\w.])\d+(?:\.\d+)?", LINK.sub("", feature))
+    assert figures
+    assert [f for f in figures if not re.search(rf"(?<![\d.]){re.escape(f)}(?![\d])", pages)] == []
 
 
 def test_the_readme_tells_the_share_that_the_benchmark_measured() -> None:
