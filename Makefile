@@ -59,7 +59,7 @@ docs: $(SITE)  ## pages and the picture made from the code, the notebook with it
 	$(MAKE) site
 
 site: $(SITE)  ## the documentation as pages in site/; fails where a link leads nowhere
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "Open site/index.html"
 
 check: $(TOOLS)  ## lint, format, types, import contracts
