@@ -128,8 +128,10 @@ def paths_named(text: str) -> set[str]:
 
 
 def is_there(path: str) -> bool:
+    """From the top or from `tests`; NAME stands for any name."""
     made = any(path.rstrip("/") == left or path.startswith(f"{left}/") for left in LEFT_BEHIND)
-    return made or any(any(root.glob(path.rstrip("/"))) for root in (PROJECT, PROJECT / "tests"))
+    pattern = path.rstrip("/").replace("NAME", "*")
+    return made or any(any(root.glob(pattern)) for root in (PROJECT, PROJECT / "tests"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -141,6 +143,7 @@ def test_a_path_that_is_not_in_the_repository_would_be_noticed() -> None:
     text = "See `tests/nowhere.py::test_x`, `docs/*.md`, `g/g`, `~/x` and\n```text\n`docs/none`\n```\n"
     assert paths_named(text) == {"tests/nowhere.py", "docs/*.md"}
     assert is_there("docs/*.md")
+    assert is_there("docs/how-to/NAME.md")
     assert not is_there("tests/nowhere.py")
 
 
