@@ -36,7 +36,8 @@ PAGES = sorted(
     for p in [*PROJECT.glob("*.md"), *(PROJECT / "docs").rglob("*.md"), *(PROJECT / "recordings").glob("*.md")]
     if p.is_file()
 )
-EXAMPLES = sorted((PROJECT / "examples").glob("*.toml"))
+OTHERS_DRIVER = PROJECT / "examples/driver"
+EXAMPLES = sorted(p for p in (PROJECT / "examples").rglob("*.toml") if p.parent != OTHERS_DRIVER)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 OPERATORS = {"|", "||", "&", "&&", ";", ">", ">>", "<"}
@@ -207,7 +208,8 @@ def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
             for command in block.commands if block.language == "console" else ():
                 assert run(command) == int(block.note.partition("exit")[2] or 0), command
                 ran += 1
-            printed = "".join(capfd.readouterr())
+            out, err = capfd.readouterr()
+            printed = err + out  # notes come before results
         if block.note == "output":
             assert not_printed(block.text, printed) == []
     assert ran
@@ -320,7 +322,6 @@ def test_the_station_of_an_example_finds_the_unit_of_its_device(kind: str) -> No
 
 
 WITH_TOML = [p for p in PAGES if any(b.language == "toml" and b.text.startswith("format") for b in blocks(p))]
-OTHERS_DRIVER = PROJECT / "examples/driver"
 
 
 @pytest.mark.parametrize("page", WITH_TOML, ids=name_of)
@@ -400,23 +401,32 @@ def in_use(kind: str) -> tuple[tc.Calibration, Any, Any]:
     return tc.Calibration.from_dict(document), 2 * rng.standard_normal((50, 3)), rng.uniform(0, 60, 50)
 
 
+def lines_of_ones_own(kind: str, language: str) -> str:
+    """For a calibration of that kind: in the how-to, or in the file that it names."""
+    if kind == "effects":
+        return (
+            (PROJECT / "examples/apply_with_effects").with_suffix(".c" if language == "c" else ".py").read_text("utf-8")
+        )
+    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.note == kind and b.language == language]
+    return block.text
+
+
 @pytest.mark.parametrize("kind", ["linear", "effects"])
 def test_the_formula_in_python_is_what_apply_does(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     c, u, temp_c = in_use(kind)
-    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "python" and b.note == kind]
     monkeypatch.chdir(tmp_path)
     c.save("cal.json")
-    names: dict[str, Any] = {"u": u, "T": temp_c}
-    exec(compile(block.text, "how-to", "exec"), names)
-    assert names["a"] == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
+    names: dict[str, Any] = {"u": u}
+    exec(compile(lines_of_ones_own(kind, "python"), "how-to", "exec"), names)
+    a = names["apply"]("cal.json", u, temp_c) if kind == "effects" else names["a"]
+    assert a == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="this machine has no C compiler")
 @pytest.mark.parametrize("kind", ["linear", "effects"])
 def test_the_formula_in_c_is_what_apply_does(kind: str, tmp_path: Path) -> None:
     c, u, temp_c = in_use(kind)
-    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "c" and b.note == kind]
-    (tmp_path / "apply.c").write_text(block.text)
+    (tmp_path / "apply.c").write_text(lines_of_ones_own(kind, "c"))
     library = tmp_path / "apply.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "apply.c"], check=True)
     function = ctypes.CDLL(str(library)).apply
