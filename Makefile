@@ -4,10 +4,11 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 TOOLS = $(VENV)/.tools
+SITE = $(VENV)/.site
 # The matrices are small: threads of linear algebra would only wait for each other.
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: demo test test-slow check format bench soak docs clean
+.PHONY: demo test test-slow check format bench soak docs site clean
 
 # An environment; the extras of $(1) in it, and $(2) says what for.
 define environment
@@ -24,6 +25,9 @@ $(READY): pyproject.toml
 
 $(TOOLS): pyproject.toml | $(READY)
 	$(call environment,test,what the tests need)
+
+$(SITE): pyproject.toml | $(TOOLS)
+	$(call environment,docs,what the documentation needs)
 
 demo: $(READY)  ## the whole line on two simulated units
 	@echo "Calibrating two simulated units: about a minute"
@@ -46,12 +50,17 @@ SOAK ?= 20m
 soak: $(TOOLS)  ## a recorder while everything fails at random, 20 minutes; SOAK=2m for less, SEED=7 for the same faults again
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.soak --time $(SOAK) $(if $(SEED),--seed $(SEED))
 
-docs: $(TOOLS)  ## pages made from the code, and the notebook with its outputs
+docs: $(SITE)  ## pages and the picture made from the code, the notebook with its outputs, and the site
 	$(BIN)/python docs/reference/python.py
 	$(BIN)/python docs/reference/profile.py
 	$(BIN)/python docs/reference/effects.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/python docs/pictures/before_after.py
 	$(BIN)/python docs/tutorial/execute.py
+	$(MAKE) site
+
+site: $(SITE)  ## the documentation as pages in site/; fails where a link leads nowhere
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "Open site/index.html"
 
 check: $(TOOLS)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
@@ -64,4 +73,4 @@ format: $(TOOLS)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo-out dist build .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) demo-out dist build site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis .cache

@@ -36,7 +36,8 @@ PAGES = sorted(
     for p in [*PROJECT.glob("*.md"), *(PROJECT / "docs").rglob("*.md"), *(PROJECT / "recordings").glob("*.md")]
     if p.is_file()
 )
-EXAMPLES = sorted((PROJECT / "examples").glob("*.toml"))
+OTHERS_DRIVER = PROJECT / "examples/driver"
+EXAMPLES = sorted(p for p in (PROJECT / "examples").rglob("*.toml") if p.parent != OTHERS_DRIVER)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 OPERATORS = {"|", "||", "&", "&&", ";", ">", ">>", "<"}
@@ -114,6 +115,39 @@ def test_every_page_is_reached_from_the_index() -> None:
     assert {name_of(p) for p in PAGES if p.is_relative_to(PROJECT / "docs")} <= {name_of(p) for p in reached}
 
 
+TOP = {p.name for p in PROJECT.iterdir()}
+LEFT_BEHIND = [
+    line.strip("/") for line in (PROJECT / ".gitignore").read_text("utf-8").splitlines() if line.startswith("/")
+]
+"""What commands of the documentation write: named in the prose, and not in the repository."""
+
+
+def paths_named(text: str) -> set[str]:
+    """The paths of the repository in backticks, outside fenced blocks."""
+    named = re.findall(r"`([\w.*-]+(?:/[\w.*-]*)+)(?:::\w+)?`", FENCE.sub("", text))
+    return {path for path in named if path.partition("/")[0] in TOP}
+
+
+def is_there(path: str) -> bool:
+    """From the top or from `tests`; NAME stands for any name."""
+    made = any(path.rstrip("/") == left or path.startswith(f"{left}/") for left in LEFT_BEHIND)
+    pattern = path.rstrip("/").replace("NAME", "*")
+    return made or any(any(root.glob(pattern)) for root in (PROJECT, PROJECT / "tests"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_path_named_in_the_documentation_is_in_the_repository(page: Path) -> None:
+    assert sorted(path for path in paths_named(page.read_text("utf-8")) if not is_there(path)) == []
+
+
+def test_a_path_that_is_not_in_the_repository_would_be_noticed() -> None:
+    text = "See `tests/nowhere.py::test_x`, `docs/*.md`, `g/g`, `~/x` and\n```text\n`docs/none`\n```\n"
+    assert paths_named(text) == {"tests/nowhere.py", "docs/*.md"}
+    assert is_there("docs/*.md")
+    assert is_there("docs/how-to/NAME.md")
+    assert not is_there("tests/nowhere.py")
+
+
 # Commands
 
 
@@ -156,20 +190,50 @@ RUNNABLE = [page for page in PAGES if any(b.note.startswith("run") for b in bloc
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE, ids=name_of)
 def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """Commands and Python in order, in one folder; a block marked as output is what the one before it printed."""
     for folder in ("recordings", "examples"):
         shutil.copytree(PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("out", "*.eeprom"))
     monkeypatch.chdir(tmp_path)
-    ran = 0
+    ran, printed = 0, ""
     for block in blocks(page):
         if block.file:
             (tmp_path / block.file).write_text(block.text, "utf-8")
         if block.note.startswith("run"):
-            for command in block.commands:
+            capfd.readouterr()
+            if block.language == "python":
+                exec(compile(block.text, str(page), "exec"), {})
+                ran += 1
+            for command in block.commands if block.language == "console" else ():
                 assert run(command) == int(block.note.partition("exit")[2] or 0), command
                 ran += 1
+            out, err = capfd.readouterr()
+            printed = err + out  # notes come before results
+        if block.note == "output":
+            assert not_printed(block.text, printed) == []
     assert ran
+
+
+def not_printed(shown: str, printed: str) -> list[str]:
+    """Of the lines shown, those that were not printed, or not in this order; "..." stands for what is left out, and
+    lines may break elsewhere, as with the width of a terminal."""
+    left, lost = " ".join(printed.split()), []
+    for line in shown.splitlines():
+        for part in filter(None, (" ".join(p.split()) for p in line.split("..."))):
+            _, found, rest = left.partition(part)
+            if found:
+                left = rest
+            else:
+                lost.append(part)
+    return lost
+
+
+def test_output_that_is_not_printed_would_be_noticed() -> None:
+    printed = "one two\nthree four\nfive\n"
+    assert not_printed("one ...\n... four\n...\nfive\n", printed) == []
+    assert not_printed("five\none two\n", printed) == ["one two"]
+    assert not_printed("one 2\n", printed) == ["one 2"]
 
 
 def run(command: str) -> int:
@@ -258,10 +322,9 @@ def test_the_station_of_an_example_finds_the_unit_of_its_device(kind: str) -> No
 
 
 WITH_TOML = [p for p in PAGES if any(b.language == "toml" and b.text.startswith("format") for b in blocks(p))]
-OTHERS_DRIVER = PROJECT / "docs/how-to/write-a-driver.md"
 
 
-@pytest.mark.parametrize("page", [p for p in WITH_TOML if p != OTHERS_DRIVER], ids=name_of)
+@pytest.mark.parametrize("page", WITH_TOML, ids=name_of)
 def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Path) -> None:
     folder_of(page, tmp_path)
     for block in blocks(page):
@@ -271,9 +334,9 @@ def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_driver_of_the_how_to_is_found_and_decodes(tmp_path: Path) -> None:
+def test_the_driver_of_the_examples_is_found_and_decodes(tmp_path: Path) -> None:
     """Installed as pip would, by its metadata, in a folder of its own."""
-    folder_of(OTHERS_DRIVER, tmp_path)
+    shutil.copytree(OTHERS_DRIVER, tmp_path, dirs_exist_ok=True)
     project = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))["project"]
     info = tmp_path / "acme_lines-1.0.dist-info"
     info.mkdir()
@@ -338,23 +401,32 @@ def in_use(kind: str) -> tuple[tc.Calibration, Any, Any]:
     return tc.Calibration.from_dict(document), 2 * rng.standard_normal((50, 3)), rng.uniform(0, 60, 50)
 
 
+def lines_of_ones_own(kind: str, language: str) -> str:
+    """For a calibration of that kind: in the how-to, or in the file that it names."""
+    if kind == "effects":
+        return (
+            (PROJECT / "examples/apply_with_effects").with_suffix(".c" if language == "c" else ".py").read_text("utf-8")
+        )
+    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.note == kind and b.language == language]
+    return block.text
+
+
 @pytest.mark.parametrize("kind", ["linear", "effects"])
 def test_the_formula_in_python_is_what_apply_does(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     c, u, temp_c = in_use(kind)
-    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "python" and b.note == kind]
     monkeypatch.chdir(tmp_path)
     c.save("cal.json")
-    names: dict[str, Any] = {"u": u, "T": temp_c}
-    exec(compile(block.text, "how-to", "exec"), names)
-    assert names["a"] == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
+    names: dict[str, Any] = {"u": u}
+    exec(compile(lines_of_ones_own(kind, "python"), "how-to", "exec"), names)
+    a = names["apply"]("cal.json", u, temp_c) if kind == "effects" else names["a"]
+    assert a == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="this machine has no C compiler")
 @pytest.mark.parametrize("kind", ["linear", "effects"])
 def test_the_formula_in_c_is_what_apply_does(kind: str, tmp_path: Path) -> None:
     c, u, temp_c = in_use(kind)
-    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "c" and b.note == kind]
-    (tmp_path / "apply.c").write_text(block.text)
+    (tmp_path / "apply.c").write_text(lines_of_ones_own(kind, "c"))
     library = tmp_path / "apply.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "apply.c"], check=True)
     function = ctypes.CDLL(str(library)).apply
@@ -492,11 +564,29 @@ def test_the_table_of_measured_recordings_is_there() -> None:
     assert len(rows) == len(set(rows)) >= 28
 
 
+README = (PROJECT / "README.md").read_text("utf-8")
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.split()) <= 650
+
+
+FEATURES = re.findall(r"^\* (\*\*It .*)$", README, re.MULTILINE)
+
+
+@pytest.mark.parametrize("feature", FEATURES, ids=lambda f: f.split("**")[1])
+def test_every_figure_of_the_readme_is_on_the_page_that_it_links_to(feature: str) -> None:
+    pages = "".join((PROJECT / t.partition("#")[0]).read_text("utf-8") for t in LINK.findall(feature))
+    figures = re.findall(r"(?<![\w.])\d+(?:\.\d+)?", LINK.sub("", feature))
+    assert figures
+    assert [f for f in figures if not re.search(rf"(?<![\d.]){re.escape(f)}(?![\d])", pages)] == []
+
+
 def test_the_readme_tells_the_share_that_the_benchmark_measured() -> None:
-    told = re.search(r"named or listed the truth in ([\d.]+) %", (PROJECT / "README.md").read_text("utf-8"))
-    page = (PROJECT / "docs/explanation/undeclared-effects.md").read_text("utf-8")
-    measured = re.search(r"^\| s = 20 to 200: .*?\| 95 % \| ([\d.]+) %", page, re.MULTILINE)
+    told = re.search(r"named or listed the truth in ([\d.]+) % .*?\[[^\]]*\]\(([^)#]+)", README)
     assert told
+    page = (PROJECT / told[2]).read_text("utf-8")
+    measured = re.search(r"^\| s = 20 to 200: .*?\| 95 % \| ([\d.]+) %", page, re.MULTILINE)
     assert measured
     assert told[1] == measured[1]
 
