@@ -1,4 +1,4 @@
-"""Writes docs/reference/misbehaving-devices.md from the rows of the tests: `python docs/reference/misbehaving-devices.py`."""
+"""Writes docs/reference/misbehaving-devices.md from the rows of the tests: run it by `python`."""
 
 from __future__ import annotations
 
