@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from triaxcald.cli.commands import parser
+from triaxcald.cli.several import COLUMNS
 
 PAGE = Path(__file__).with_suffix(".md")
 HEAD = """# Command line
@@ -89,6 +90,11 @@ Exit 0 whatever the verdict; `--limit` judges. Several recordings are of one uni
     "log export": """Every measuring command reads this format. A phase or stream without samples is an error (exit 2). The output must not exist.""",  # noqa: E501
     "log import": """Also of a recording of [all frames of a bus](recording.md#all-frames-of-a-bus). A summary of dropped frames is on standard error. [How](../how-to/import-a-log.md). Document `triaxcal.import/1`.""",  # noqa: E501
 }
+UNITS = """The columns of `--units`:
+
+| column | |
+|---|---|
+"""
 
 
 def page() -> str:
@@ -125,6 +131,7 @@ def _section(name: str, p: argparse.ArgumentParser, shared: dict[str, str | None
     parts = [f"## triaxcal {name}\n", f"    triaxcal {name} {_usage(p)}".rstrip() + "\n"]
     parts += [f"{p.description}\n", f"{NOTES[name]}\n"]
     parts += [_table(own)] if own else []
+    parts += [UNITS + "".join(f"| {_cell(k)} | {_cell(v)} |\n" for k, v in COLUMNS.items())] * (name == "diagnose")
     parts += [f"Shared options: {', '.join(listed)}.\n"] if listed else []
     parts += [f"[Tables](tables.md): {', '.join(of_tables)}.\n"] if of_tables else []
     parts += [f"Example: `{p.epilog.removeprefix('example: ')}`\n"] if p.epilog else []
