@@ -2,7 +2,7 @@
 algebra that numpy and scipy bring.
 
 Several threads add numbers up in another order than one, so that the last
-digits depend on how many there are (docs/decisions/0007).
+digits depend on how many there are (decision 0057).
 """
 
 from __future__ import annotations
