@@ -4,7 +4,7 @@
     python -m benchmarks.undeclared --one hysteresis 3 --poses 26 --size 20:200 --noise white
 
 The recordings are those of `tests/undeclared`, whose physics is written without the effects of the package. Sizes s
-and the told-in-advance optimum: docs/explanation/undeclared-effects.md.
+and the told-in-advance optimum: docs/explanation/diagnosis.md.
 """
 
 from __future__ import annotations

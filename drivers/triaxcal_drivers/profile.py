@@ -36,9 +36,11 @@ class Strict(BaseModel):
 
 
 class Identity(Strict):
-    vendor: str
-    product: str
-    serial_register: Annotated[str | None, Field(description="register that holds the serial number")] = None
+    vendor: Annotated[str, Field(description="for people")]
+    product: Annotated[str, Field(description="for people")]
+    serial_register: Annotated[
+        str | None, Field(description="register that holds the serial number, an integer without scale and offset")
+    ] = None
     expect: Annotated[
         dict[str, int], Field(description="registers that must hold these raw numbers: product code, vendor…")
     ] = {}
@@ -72,8 +74,10 @@ class Output(Strict):
 
 class Sampling(Strict):
     rate_hz: Annotated[float, Field(gt=0, description="samples a second that the device delivers")]
-    silence_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 2.0
-    reply_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
+    silence_timeout_s: Annotated[
+        float, Field(gt=0, le=3600, description="without samples for so long a stream is silent")
+    ] = 2.0
+    reply_timeout_s: Annotated[float, Field(gt=0, le=3600, description="how long a request waits for its reply")] = 1.0
 
 
 class Register(Strict):
@@ -87,15 +91,15 @@ class Register(Strict):
     it is an exact integer where type, scale and offset are integers.
     """
 
-    type: RawType
-    role: str | None = None
-    access: Literal["ro", "rw", "wo"] = "rw"
-    unit: str = ""
-    scale: int | float = 1.0
-    offset: int | float = 0.0
-    minimum: int | float | None = None
-    maximum: int | float | None = None
-    description: str = ""
+    type: Annotated[RawType, Field(description="one of the register types")]
+    role: Annotated[str | None, Field(description="what it is to a calibration: scale_factor.x, bias.y…")] = None
+    access: Annotated[Literal["ro", "rw", "wo"], Field(description="what may be done with it")] = "rw"
+    unit: Annotated[str, Field(description="unit of its value")] = ""
+    scale: Annotated[int | float, Field(description="value = raw * scale + offset")] = 1.0
+    offset: Annotated[int | float, Field(description="value = raw * scale + offset")] = 0.0
+    minimum: Annotated[int | float | None, Field(description="no smaller value is written")] = None
+    maximum: Annotated[int | float | None, Field(description="no larger value is written")] = None
+    description: Annotated[str, Field(description="for people")] = ""
 
     @model_validator(mode="after")
     def _sound(self) -> Self:
@@ -115,19 +119,19 @@ class WriteStep(Strict):
 
 
 class WaitStep(Strict):
-    wait_s: Annotated[float, Field(ge=0, le=60)]
+    wait_s: Annotated[float, Field(ge=0, le=60, description="do nothing for so long")]
 
 
 class PollStep(Strict):
     poll: Annotated[str, Field(description="register to read until it holds `until`")]
-    until: int | float
+    until: Annotated[int | float, Field(description="value to wait for")]
     mask: Annotated[int | None, Field(gt=0, description="the bits of an integer register that count")] = None
-    timeout_s: Annotated[float, Field(gt=0, le=120)] = 2.0
+    timeout_s: Annotated[float, Field(gt=0, le=120, description="how long to wait for it")] = 2.0
 
 
 class ReconnectStep(Strict):
     reconnect: Annotated[Literal[True], Field(description="close and open the connection, trying until it answers")]
-    timeout_s: Annotated[float, Field(gt=0, le=120)] = 5.0
+    timeout_s: Annotated[float, Field(gt=0, le=120, description="how long to try")] = 5.0
 
 
 Step = WriteStep | WaitStep | PollStep | ReconnectStep
@@ -138,10 +142,10 @@ class Sequences(Strict):
     """What to do before writing, to make it permanent, after writing, and to
     start the device afresh."""
 
-    unlock: Steps = ()
-    store: Steps = ()
-    lock: Steps = ()
-    reset: Steps = ()
+    unlock: Annotated[Steps, Field(description="steps before writing")] = ()
+    store: Annotated[Steps, Field(description="steps that make writes last; without any, each write lasts")] = ()
+    lock: Annotated[Steps, Field(description="steps after writing")] = ()
+    reset: Annotated[Steps, Field(description="steps that restart the device; without any, only the supply does")] = ()
 
 
 class Crc(Strict):
@@ -150,9 +154,9 @@ class Crc(Strict):
     Each most significant byte first, whatever the order on the wire.
     """
 
-    register_name: Annotated[str, Field(alias="register")]
-    algorithm: Literal["crc-16/modbus", "crc-32"]
-    over: Annotated[tuple[str, ...], Field(min_length=1)]
+    register_name: Annotated[str, Field(alias="register", description="register that holds it")]
+    algorithm: Annotated[Literal["crc-16/modbus", "crc-32"], Field(description="how it is computed")]
+    over: Annotated[tuple[str, ...], Field(min_length=1, description="registers that it covers, in order")]
 
 
 class Correction(Strict):
@@ -177,10 +181,10 @@ class Profile(Strict):
     wire_order: ClassVar[codec.ByteOrder] = "big"
     """Of the bytes that a driver reads and writes for a register."""
 
-    format: Literal["triaxcal.profile/1"]
-    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
-    title: str = ""
-    driver: str
+    format: Annotated[Literal["triaxcal.profile/1"], Field(description="always this text")]
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", description="lower case, digits, ., _ and -")]
+    title: Annotated[str, Field(description="for people")] = ""
+    driver: Annotated[str, Field(description="can, modbus, mcap (files alone), or an installed driver")]
     identity: Identity
     output: Output
     sampling: Sampling

@@ -1,6 +1,8 @@
 """The JSON Schemas in the documentation are those of the code, and fit the built-in profiles."""
 
 import json
+import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -21,6 +23,17 @@ def test_the_committed_schema_is_what_the_command_prints(driver):
     ).stdout
     committed = json.loads((REFERENCE / f"profile-{driver}.schema.json").read_bytes())
     assert json.loads(printed) == committed, "the schema is stale; run make docs"
+
+
+def test_the_page_of_the_keys_is_that_of_the_models():
+    names = runpy.run_path(str(REFERENCE / "profile-keys.py"))
+    assert names["PAGE"].read_text("utf-8") == names["page"](), "run make docs"
+
+
+def test_every_key_of_a_profile_says_what_it_is():
+    rows = re.findall(r"^\| (`.*) \|$", (REFERENCE / "profile-keys.md").read_text("utf-8"), re.MULTILINE)
+    assert rows
+    assert [row for row in rows if not row.split(" | ")[-1].strip()] == []
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What the loop makes of effects that nobody declared: the claims of docs/explanation/undeclared-effects.md.
+"""What the loop makes of effects that nobody declared: the claims of docs/explanation/diagnosis.md.
 
 At a size that runs in seconds, of recordings that are always the same: a claim fails where a share as it is, or worse,
 has a probability below `RARE` if the claim holds. The whole of it: ``python -m benchmarks.undeclared``.

@@ -127,7 +127,8 @@ STEPS = 12
 """Of the search for amplitudes. Always all, so that the same bits come out
 everywhere; each step costs as much as the first."""
 FLICKER = 0.3
-"""Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
+"""Odds, before the data, of 1/f noise strong enough to matter
+(docs/explanation/stillness.md)."""
 GAPS = 1 / 3
 """Share of a pose that is missing from which on it is reckoned what its mean
 takes from the slow noise (`_taken_by_the_mean`). Bumps leave gaps of less; after

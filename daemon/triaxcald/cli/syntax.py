@@ -299,7 +299,7 @@ def _line(commands: Any) -> None:
         "demo --out demo-out",
     )  # fmt: skip
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
-    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses")
+    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
     add_json(p)
     p = _command(
         commands, "run", "line:run_command", "the whole line on the devices of a station file",
@@ -324,7 +324,10 @@ def _line(commands: Any) -> None:
         "record station.toml -o rec.mcap --seconds 120",
     )  # fmt: skip
     p.add_argument("station", metavar="STATION.toml", type=Path)
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="REC.mcap|FOLDER")
+    p.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="REC.mcap|FOLDER",
+        help="a recording, which must not exist; or a folder, which must: all units and buses, each into its own file",
+    )  # fmt: skip
     p.add_argument(
         "--seconds", type=positive, metavar="S",
         help="of the samples' time, of a bus by the clock; default: until interrupted",
@@ -408,7 +411,7 @@ def _on_recordings(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL.json")
     add_recording(p)
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this")
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this, in g")
     _frame(commands)
 
 
@@ -449,9 +452,9 @@ def _add_results(p: argparse.ArgumentParser) -> None:
 
 
 def _add_files(p: argparse.ArgumentParser) -> None:
-    p.add_argument("-o", "--output", type=Path, metavar="CAL.json")
-    p.add_argument("--report", type=Path, metavar="R.html")
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this")
+    p.add_argument("-o", "--output", type=Path, metavar="CAL.json", help="the document; not a file that is read")
+    p.add_argument("--report", type=Path, metavar="R.html", help="the same for people, in one file")
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this, in g")
 
 
 def _frame(commands: Any) -> None:
@@ -486,7 +489,7 @@ def _frame(commands: Any) -> None:
     p.add_argument("--seating-error", type=_angle, metavar="RAD", help="standard error of one seating of the fixture")
     p.add_argument("--turn-error", type=_angle, default=0.0, metavar="RAD", help="standard error of a turn; default 0")
     p.add_argument("--limit", type=positive, metavar="RAD", help="exit 1 where a standard error is above this")
-    p.add_argument("-o", "--output", type=Path, metavar="FRAME.json")
+    p.add_argument("-o", "--output", type=Path, metavar="FRAME.json", help="the document")
 
 
 def _faces(text: str) -> list[tuple[str, float | None]]:
@@ -596,8 +599,8 @@ def _audits(commands: Any) -> None:
     )
     p.add_argument("recording", metavar="REC", type=Path)
     p.add_argument("-o", "--output", type=Path, help="default: standard output")
-    p.add_argument("--stream", default=READINGS)
-    p.add_argument("--phase", default=PHASES[0], choices=PHASES)
+    p.add_argument("--stream", default=READINGS, help="or corrected: the device's own output, in g")
+    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="verification: the check poses after writing")
     p = _command(
         parts, "import", "importing:import_command", "make a recording of a log that others recorded",
         "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, or MCAP with messages of ROS 2, JSON or protobuf, "

@@ -105,8 +105,8 @@ class Scaling(Strict):
     """Takes the place of the file's own scaling where given: value = raw *
     scale + offset."""
 
-    scale: float | None = None
-    offset: float | None = None
+    scale: Annotated[float | None, Field(description="in place of the file's")] = None
+    offset: Annotated[float | None, Field(description="in place of the file's")] = None
 
     @model_validator(mode="after")
     def _not_zero(self) -> Self:
@@ -120,7 +120,7 @@ class DbcChannel(Scaling):
 
 
 class PdoChannel(Scaling):
-    object: ObjectName
+    object: Annotated[ObjectName, Field(description="mapped object, as 0x2300:01")]
 
 
 class _Validity(Strict):
@@ -142,7 +142,7 @@ class DbcValidity(_Validity):
 
 
 class PdoValidity(_Validity):
-    object: ObjectName
+    object: Annotated[ObjectName, Field(description="mapped object, as 0x2300:01")]
 
 
 def _named(key: str, channel: type[Strict]) -> BeforeValidator:
@@ -165,7 +165,7 @@ Together = Annotated[
 
 
 class _Stream(Strict):
-    counter: str | None = None
+    counter: Annotated[str | None, Field(description="signal that all messages of a sample bear")] = None
     together: Together = None
     channels: Mapping[str, Scaling]
 
@@ -187,10 +187,14 @@ class DbcStream(_Stream):
     difference.
     """
 
-    layout: Literal["dbc"]
-    file: str
-    base_node_id: Annotated[int | None, Field(ge=1, le=127)] = None
-    valid: Annotated[DbcValidity | None, _named("signal", DbcValidity)] = None
+    layout: Annotated[Literal["dbc"], Field(description="dbc: a DBC file describes the messages")]
+    file: Annotated[str, Field(description="the DBC file, in the profile's folder or below it")]
+    base_node_id: Annotated[
+        int | None, Field(ge=1, le=127, description="node of the DBC's identifiers; at another node they shift")
+    ] = None
+    valid: Annotated[
+        DbcValidity | None, _named("signal", DbcValidity), Field(description="signal that says whether a sample counts")
+    ] = None
     channels: Annotated[
         Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]], Field(max_length=CHANNELS_MOST)
     ]
@@ -208,10 +212,12 @@ class PdoStream(_Stream):
     """A stream whose messages are the TPDOs that an EDS file maps; channels are
     the mapped objects."""
 
-    layout: Literal["pdo"]
-    eds: str
-    counter: ObjectName | None = None
-    valid: Annotated[PdoValidity | None, _named("object", PdoValidity)] = None
+    layout: Annotated[Literal["pdo"], Field(description="pdo: an EDS file maps the messages")]
+    eds: Annotated[str, Field(description="the EDS file, in the profile's folder or below it")]
+    counter: Annotated[ObjectName | None, Field(description="object that all messages of a sample bear")] = None
+    valid: Annotated[
+        PdoValidity | None, _named("object", PdoValidity), Field(description="object that says whether a sample counts")
+    ] = None
     channels: Annotated[
         Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]], Field(max_length=CHANNELS_MOST)
     ]
@@ -236,7 +242,7 @@ class CanRegister(Register):
     """A register that is an object of the CANopen object dictionary, reached by
     SDO."""
 
-    object: ObjectName
+    object: Annotated[ObjectName, Field(description="index and sub-index, as 0x2100:01")]
 
 
 class CanProfile(Profile):

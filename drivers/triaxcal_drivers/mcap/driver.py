@@ -33,9 +33,9 @@ FieldPath = Annotated[
 class MessageChannel(Strict):
     """value = field * scale + offset."""
 
-    field: FieldPath
-    scale: float = 1.0
-    offset: float = 0.0
+    field: Annotated[FieldPath, Field(description="its place in the message: imu.acceleration.x, data.2")]
+    scale: Annotated[float, Field(description="value = field * scale + offset")] = 1.0
+    offset: Annotated[float, Field(description="value = field * scale + offset")] = 0.0
 
     @model_validator(mode="after")
     def _not_zero(self) -> Self:
@@ -52,7 +52,7 @@ _NAMED = BeforeValidator(
 class MessageStream(Strict):
     """The messages of one topic, a sample each."""
 
-    topic: str
+    topic: Annotated[str, Field(description="whose messages are the samples")]
     time: Annotated[
         FieldPath | None,
         Field(

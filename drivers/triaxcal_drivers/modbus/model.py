@@ -35,10 +35,10 @@ class Channel(Strict):
     """A number in a reply or record; the value is ``raw * scale + offset``."""
 
     word: Annotated[Word, Field(description="first word, counted from the start of the reply or record")]
-    type: WordType
-    scale: float = 1.0
-    offset: float = 0.0
-    unit: str = ""
+    type: Annotated[WordType, Field(description="one of the register types")]
+    scale: Annotated[float, Field(description="value = raw * scale + offset")] = 1.0
+    offset: Annotated[float, Field(description="value = raw * scale + offset")] = 0.0
+    unit: Annotated[str, Field(description="unit of its value")] = ""
     word_order: Annotated[Order | None, Field(description="where it differs from the profile's")] = None
 
     @model_validator(mode="after")
@@ -51,8 +51,8 @@ class Channel(Strict):
 class Counter(Strict):
     """A sample counter; it wraps at 2^bits."""
 
-    word: Word
-    type: CounterType
+    word: Annotated[Word, Field(description="its word in the block or record")]
+    type: Annotated[CounterType, Field(description="its type")]
     bits: Annotated[int | None, Field(ge=4, le=32, description="where fewer than the type has")] = None
 
     @property
@@ -64,21 +64,21 @@ class TimeStamp(Strict):
     """The device's time of a sample, in ticks of ``unit_s``; it wraps with its
     type."""
 
-    word: Word
-    type: TimeType
+    word: Annotated[Word, Field(description="its word in the block or record")]
+    type: Annotated[TimeType, Field(description="its type")]
     unit_s: Annotated[float, Field(gt=0, description="seconds a tick: 1e-6, 0.001…")]
 
 
 class _Stream(Strict):
-    table: Table = "input"
-    address: Address
-    poll_period_s: Annotated[float, Field(ge=0, le=60)]
+    table: Annotated[Table, Field(description="registers that are read: input or holding")] = "input"
+    address: Annotated[Address, Field(description="first register, from 0 as on the wire")]
+    poll_period_s: Annotated[float, Field(ge=0, le=60, description="from one read to the next")]
     channels: Annotated[
         dict[str, Channel],
         Field(max_length=CHANNELS_MOST, description="ux, uy and uz; any further ones by their names"),
     ]
-    counter: Counter | None = None
-    time_stamp: TimeStamp | None = None
+    counter: Annotated[Counter | None, Field(description="sample counter: tells missing and repeated samples")] = None
+    time_stamp: Annotated[TimeStamp | None, Field(description="the device's time of a sample")] = None
 
     @model_validator(mode="after")
     def _has_axes(self) -> Self:
@@ -112,7 +112,7 @@ class PollStream(_Stream):
     """A block of registers that holds the newest sample; read once a poll
     period."""
 
-    layout: Literal["poll"]
+    layout: Annotated[Literal["poll"], Field(description="poll: a block with the newest sample")]
 
     @property
     def words(self) -> int:
@@ -135,10 +135,10 @@ class FifoHeader(Strict):
 class FifoStream(_Stream):
     """A window on the device's FIFO; reading it takes the records out."""
 
-    layout: Literal["fifo"]
+    layout: Annotated[Literal["fifo"], Field(description="fifo: a window on a FIFO")]
     header: FifoHeader
     record_start: Annotated[Word, Field(description="word at which the first record begins")]
-    record_words: Annotated[int, Field(ge=3, le=MAX_READ_WORDS)]
+    record_words: Annotated[int, Field(ge=3, le=MAX_READ_WORDS, description="words of a record")]
     record_capacity: Annotated[int, Field(ge=1, le=MAX_READ_WORDS, description="records in a window")]
 
     @model_validator(mode="after")
@@ -164,8 +164,8 @@ Stream = Annotated[PollStream | FifoStream, Field(discriminator="layout")]
 
 
 class ModbusRegister(Register):
-    table: Table = "holding"
-    address: Address
+    table: Annotated[Table, Field(description="holding or input")] = "holding"
+    address: Annotated[Address, Field(description="first word, from 0 as on the wire")]
     word_order: Annotated[Order | None, Field(description="where it differs from the profile's")] = None
 
     @model_validator(mode="after")
@@ -186,10 +186,12 @@ class ModbusProfile(Profile):
 
     streams: Annotated[dict[str, Stream], Field(max_length=STREAMS_MOST)]
     registers: dict[str, ModbusRegister] = Field(default_factory=dict)
-    word_order: Order = "big"
-    byte_order: Order = "big"
-    max_read_words: Annotated[int, Field(ge=1, le=MAX_READ_WORDS)] = MAX_READ_WORDS
-    max_write_words: Annotated[int, Field(ge=1, le=MAX_WRITE_WORDS)] = MAX_WRITE_WORDS
+    word_order: Annotated[Order, Field(description="of words in a value; big: most significant first")] = "big"
+    byte_order: Annotated[Order, Field(description="of bytes in a word; big: most significant first")] = "big"
+    max_read_words: Annotated[int, Field(ge=1, le=MAX_READ_WORDS, description="most words of a read")] = MAX_READ_WORDS
+    max_write_words: Annotated[int, Field(ge=1, le=MAX_WRITE_WORDS, description="most words of a write")] = (
+        MAX_WRITE_WORDS
+    )
     busy_codes: Annotated[
         tuple[int, ...],
         Field(description="exception codes by which a request is refused for now, and may be repeated"),

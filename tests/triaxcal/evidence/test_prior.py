@@ -8,7 +8,7 @@ from pathlib import Path
 
 from triaxcal.evidence import Odds
 
-PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "what-acts.md"
+PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "diagnosis.md"
 
 
 def test_the_documentation_has_every_constant_with_its_value() -> None:

@@ -96,7 +96,7 @@ def _without_pauses(place: list[Ints]) -> list[Ints]:
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
 SPAN_LEAST_S = 0.4
-"""Four windows (decision 0008): in less there is hardly a middle beside the
+"""Four windows: in less there is hardly a middle beside the
 ends."""
 REJOIN_S = 1.5
 """A disturbance shorter than this, with the same mean before and after, is a

@@ -20,7 +20,7 @@ from triaxcal.errors import InvalidData
 
 WINDOW_S = 0.1
 """Short beside a pose and a move, so that edges cost little; long beside a
-sample, so that summaries are few (decision 0008)."""
+sample, so that summaries are few."""
 WINDOW_LEAST = 3
 """Samples in a window at low rates: fewer tell no scatter."""
 GAP = 4.0
