@@ -54,6 +54,9 @@ docs: $(SITE)  ## pages and the picture made from the code, the notebook with it
 	$(BIN)/python docs/reference/python.py
 	$(BIN)/python docs/reference/profile.py
 	$(BIN)/python docs/reference/effects.py
+	$(BIN)/python docs/reference/cli.py
+	$(BIN)/python docs/reference/misbehaving-devices.py
+	$(BIN)/python docs/reference/profile-keys.py
 	$(BIN)/python docs/pictures/before_after.py
 	$(BIN)/python docs/tutorial/execute.py
 	$(MAKE) site

@@ -447,7 +447,7 @@ def test_the_formula_in_c_is_what_apply_does(kind: str, tmp_path: Path) -> None:
 
 
 def test_the_closed_form_can_be_redone_by_hand() -> None:
-    (block,) = [b for b in blocks(PROJECT / "docs/explanation/the-model.md") if b.language == "python"]
+    (block,) = [b for b in blocks(PROJECT / "docs/explanation/the-fit.md") if b.language == "python"]
     exec(block.text, {})
 
 

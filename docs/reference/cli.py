@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from triaxcald.cli.commands import parser
-from triaxcald.cli.several import COLUMNS
+from triaxcald.cli.fitting import COLUMNS
 
 PAGE = Path(__file__).with_suffix(".md")
 HEAD = """# Command line

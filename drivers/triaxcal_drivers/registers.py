@@ -16,13 +16,6 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.errors import RegisterValueError
 
-if TYPE_CHECKING:
-    RawType = str
-    WordType = str
-    TimeType = str
-    CounterType = str
-
-
 # The types of raw numbers: how a register or a field of a stream holds a number in
 # bytes.
 
@@ -161,6 +154,22 @@ def next_in_words(name: str) -> str | None:
 
     longer = [other for other in TYPES if serves(TYPES[other])]
     return min(longer, key=lambda other: TYPES[other].size, default=None)
+
+
+if TYPE_CHECKING:
+    RawType = str
+    WordType = str
+    TimeType = str
+    CounterType = str
+else:
+    RawType = Literal[tuple(TYPES)]
+    """What a register of a profile may be."""
+    WordType = Literal[tuple(filter(in_words, TYPES))]
+    """What a register or channel on Modbus may be."""
+    TimeType = Literal[tuple(filter(counts, TYPES))]
+    """What a device's time stamp may be."""
+    CounterType = Literal[tuple(name for name in TYPES if counts(name) and TYPES[name].size <= 4)]
+    """What a sample counter may be: one of 2^32 samples turns once in decades."""
 
 
 ByteOrder = Literal["big", "little"]

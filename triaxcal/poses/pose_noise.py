@@ -29,7 +29,7 @@ from triaxcal.poses.stillness.windows import Windows, left_in_means, resolution,
 CYCLES_LEAST = 4.0
 """What is slower, in cycles a pose, is the noise that the mean has."""
 WINDOWS_LEAST = 24
-"""A pose of 2.4 s (decision 0025): shorter ones have too little noise beside a
+"""A pose of 2.4 s: shorter ones have too little noise beside a
 tone to tell it by."""
 TONES_MOST = 6
 """Each takes three degrees of freedom: so many leave a quarter of the shortest
