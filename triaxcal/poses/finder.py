@@ -7,7 +7,7 @@ from typing import Any
 
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
-from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
+from triaxcal.poses.quality import QualityDetector, QualityFinding, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector
 from triaxcal.poses.stillness.windows import Windows
 
@@ -25,7 +25,7 @@ class PoseFinder:
         self._stillness = StillnessDetector()
         self._quality = QualityDetector()
         self._spans: tuple[int, list[Span]] = (0, [])
-        self._findings: list[Finding] | None = None
+        self._findings: list[QualityFinding] | None = None
 
     def feed(self, time_ns: Any, readings: Any, channels: Mapping[str, Any] | None = None) -> None:
         """Times (n,) in nanoseconds, readings (n,3) in output units, and channels
@@ -78,7 +78,7 @@ class PoseFinder:
             self._spans = (len(windows), self._stillness.spans(self._turn_s))
         return self._spans[1]
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[QualityFinding]:
         """Faults of the samples so far, cached."""
         if self._findings is None:
             self._findings = self._quality.findings(self.windows, self.spans())

@@ -28,7 +28,7 @@ class Touched:
 
 
 @dataclass(frozen=True)
-class Finding:
+class QualityFinding:
     """A kind of fault with its data-quality ``name``; `triaxcal.text` describes it in
     a sentence."""
 
@@ -52,7 +52,7 @@ class AtRail:
 
 
 @dataclass(frozen=True)
-class Saturation(Finding):
+class Saturation(QualityFinding):
     name: ClassVar[str] = "saturation"
     rails: tuple[AtRail, ...]
 
@@ -83,7 +83,7 @@ class SlowUpdate:
 
 
 @dataclass(frozen=True)
-class StuckOutput(Finding):
+class StuckOutput(QualityFinding):
     """``dead`` are axes that never change."""
 
     name: ClassVar[str] = "stuck_output"
@@ -97,7 +97,7 @@ class StuckOutput(Finding):
 
 
 @dataclass(frozen=True)
-class MissingSamples(Finding):
+class MissingSamples(QualityFinding):
     """By the times, ``missing`` of ``of`` samples, in ``gaps`` gaps."""
 
     name: ClassVar[str] = "missing_samples"
@@ -109,7 +109,7 @@ class MissingSamples(Finding):
 
 
 @dataclass(frozen=True)
-class DuplicateSamples(Finding):
+class DuplicateSamples(QualityFinding):
     """``repeated`` samples equal the previous one on all axes."""
 
     name: ClassVar[str] = "duplicate_samples"
@@ -128,7 +128,7 @@ class Tone:
 
 
 @dataclass(frozen=True)
-class MainsPickup(Finding):
+class MainsPickup(QualityFinding):
     name: ClassVar[str] = "mains_pickup"
     tones: tuple[Tone, ...]
     rate_hz: float
@@ -146,7 +146,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class CoarseQuantization(Finding):
+class CoarseQuantization(QualityFinding):
     name: ClassVar[str] = "coarse_quantization"
     axes: tuple[Steps, ...]
 
@@ -165,7 +165,7 @@ class Disturbance:
 
 
 @dataclass(frozen=True)
-class DisturbedPoses(Finding):
+class DisturbedPoses(QualityFinding):
     """``disturbed`` are the indices of the poses, ``of`` the number of all."""
 
     name: ClassVar[str] = "disturbed_pose"
@@ -186,12 +186,12 @@ class Move:
 
 
 @dataclass(frozen=True)
-class MergedPoses(Finding):
+class MergedPoses(QualityFinding):
     name: ClassVar[str] = "merged_poses"
     moves: tuple[Move, ...]
 
 
-def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
+def untrusted_poses(findings: Iterable[QualityFinding]) -> dict[int, str]:
     """By index, the still spans in which the outputs do not follow the
     acceleration, with the name of the fault."""
     return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
