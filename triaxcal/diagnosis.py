@@ -15,7 +15,7 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
+from triaxcal.estimate.calibration import Calibration, Exclusion, ReferenceEpoch
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.corrected_calibration import corrected
@@ -220,7 +220,7 @@ def diagnose(
     progress(Stage.FIT)
     linear = fit(poses, signs=signs, reference=reference)
     sound = [p for p in poses if not p.fault]
-    moment = HoldsAt.of(sound, at)
+    moment = ReferenceEpoch.of(sound, at)
     if moment is None:
         raise Refused("no pose without a fault")
     posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds, progress=progress)
@@ -272,7 +272,7 @@ class _Report:
     it would be if it acted."""
 
     posterior: Posterior
-    moment: HoldsAt
+    moment: ReferenceEpoch
     after: Calibration
     found: Findings
     conditional: dict[str, Calibration] = field(default_factory=dict)

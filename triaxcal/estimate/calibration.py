@@ -159,7 +159,7 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class HoldsAt:
+class ReferenceEpoch:
     """The reference epoch: the moment at which effects of time are evaluated in
     another recording, whose clock is its own.
 
@@ -173,7 +173,7 @@ class HoldsAt:
     time_s: float
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> HoldsAt | None:
+    def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> ReferenceEpoch | None:
         """The epoch of a set of poses; None where there are none. A number ``at`` is
         a moment in seconds. Raises InvalidData for one before the start."""
         if not poses:
@@ -360,7 +360,7 @@ class Calibration:
     prior_sd: Floats | None = field(default=None, repr=False)
     thermal: Floats | None = field(default=None, repr=False)
     unmodelled: Unmodelled | None = None
-    holds_at: HoldsAt | None = None
+    holds_at: ReferenceEpoch | None = None
     linear_only: Calibration | None = field(default=None, repr=False)
     update: BiasUpdate | None = field(default=None, repr=False)
 

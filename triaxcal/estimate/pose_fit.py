@@ -19,11 +19,11 @@ from triaxcal.estimate.calibration import (
     ExcludedPose,
     Exclusion,
     FaultyPosesExcluded,
-    HoldsAt,
     OutlierSetsTied,
     OutliersExcluded,
     PoseResult,
     PosesExcludedByCaller,
+    ReferenceEpoch,
     UnknownHistoryExcluded,
 )
 from triaxcal.estimate.creep import slopes_p, with_slopes
@@ -370,7 +370,7 @@ def fit(
         among = None if excluded is None else [k for k, i in enumerate(sound) if i in excluded]
         kept = [poses[i] for i in sound]
         sound_fit = fit(kept, signs=signs, reference=reference, effects=effects, excluded=among, why=why)
-        return replace(with_faulty(sound_fit, poses), holds_at=HoldsAt.of(poses))
+        return replace(with_faulty(sound_fit, poses), holds_at=ReferenceEpoch.of(poses))
     # Closed form with all poses, then the selection of poses.
     whole, begin = started_problem(poses, signs=signs, reference=reference, effects=effects)
     _require_channels(whole, effects)
@@ -392,7 +392,7 @@ def fit(
     calibration = concluded(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if chosen.rows:
         calibration = with_excluded(calibration, poses, chosen.rows, chosen.outliers, why)
-    return replace(with_tied_sets(calibration, poses, chosen.outliers), holds_at=HoldsAt.of(poses))
+    return replace(with_tied_sets(calibration, poses, chosen.outliers), holds_at=ReferenceEpoch.of(poses))
 
 
 def _require_channels(problem: Problem, effects: Sequence[Effect]) -> None:

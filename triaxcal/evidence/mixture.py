@@ -13,7 +13,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.evidence.likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.row_covariance import RowPrecision, inverse_of
@@ -134,7 +134,7 @@ class Projection:
     by_term: Floats
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> Projection:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, likeliest: Sequence[Effect]) -> Projection:
         evidence = posterior.evidence
         rows = evidence.rows
         # Compare effects in the poses, and in readings of the next recording.
@@ -210,7 +210,7 @@ class NextReadings:
     error: float
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, directions: Floats) -> NextReadings:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, directions: Floats) -> NextReadings:
         rows = posterior.evidence.rows
         up = directions * rows.problem.reference
         found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))

@@ -19,7 +19,7 @@ from triaxcal.arrays import Floats, rms
 from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
-from triaxcal.estimate.calibration import HoldsAt, Unmodelled
+from triaxcal.estimate.calibration import ReferenceEpoch, Unmodelled
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
 from triaxcal.evidence.mixture import NEGLIGIBLE_PROBABILITY, Components, Projection, components
 from triaxcal.evidence.over_sphere import OverSphere, Smooth
@@ -212,7 +212,7 @@ def refusal(posterior: Posterior) -> Refusal | None:
     return None
 
 
-def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | None = None) -> Average:
+def average(posterior: Posterior, at: ReferenceEpoch, mixture: Sequence[Components] | None = None) -> Average:
     """The average over all sets, sizes and parts of the named effects, for the epoch
     ``at``. ``mixture`` are the likeliest sets (`components`), where already known."""
     mixture = components(posterior) if mixture is None else mixture
@@ -220,7 +220,7 @@ def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | N
 
 
 def least_loss(
-    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]
+    posterior: Posterior, at: ReferenceEpoch, linear: Sensor, mixture: Sequence[Components]
 ) -> tuple[Average, Refusal | None]:
     """The correction with the least expected error, and the reason for no effects in
     it. The candidates are the ``linear`` sensor and the averages that the posterior
@@ -246,7 +246,9 @@ def least_loss(
     return (whole if whole.loss <= odds.gain * alone.loss else alone), why
 
 
-def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mixture: Sequence[Components]) -> Average:
+def _of_likely(
+    posterior: Posterior, sphere: OverSphere | None, at: ReferenceEpoch, mixture: Sequence[Components]
+) -> Average:
     listed = _likeliest(posterior)
     made = _of_listed(posterior, sphere, at, listed, mixture)
     kept = [effect for effect in listed if _selected(posterior, made, effect)]
@@ -256,7 +258,7 @@ def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mix
 def _of_listed(
     posterior: Posterior,
     sphere: OverSphere | None,
-    at: HoldsAt,
+    at: ReferenceEpoch,
     listed: Sequence[Effect],
     mixture: Sequence[Components],
 ) -> Average:
@@ -269,7 +271,7 @@ def _of_listed(
     return _with_errors(posterior, sphere, at, projection, moved, state, mean, process_bias, mixture)
 
 
-def _smooth(posterior: Posterior, sphere: OverSphere, at: HoldsAt, mixture: Sequence[Components]) -> Average:
+def _smooth(posterior: Posterior, sphere: OverSphere, at: ReferenceEpoch, mixture: Sequence[Components]) -> Average:
     """The sensor with the mean of all functions of direction as a smooth term, and
     the nine parameters of the best fit with it; between the poses the function is
     interpolated. Effects of temperature, time or memory are omitted: without a true
@@ -305,7 +307,7 @@ def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
 
 
 def _linear_alone(
-    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components], sphere: OverSphere
+    posterior: Posterior, at: ReferenceEpoch, linear: Sensor, mixture: Sequence[Components], sphere: OverSphere
 ) -> Average:
     """The ``linear`` sensor with the errors from all likely sets: the result where no
     effect is corrected."""
@@ -318,7 +320,7 @@ def _linear_alone(
 def _with_errors(
     posterior: Posterior,
     sphere: OverSphere | None,
-    at: HoldsAt,
+    at: ReferenceEpoch,
     projection: Projection,
     sensor: Sensor,
     state: State,

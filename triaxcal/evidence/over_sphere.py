@@ -15,7 +15,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import SMOOTH, Empirical
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.evidence.mixture import Components, NextReadings
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.terms import Term
@@ -101,7 +101,7 @@ class OverSphere:
     """Cached parts."""
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, mixture: Sequence[Components]) -> OverSphere:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, mixture: Sequence[Components]) -> OverSphere:
         there = NextReadings.of(posterior, at, spiral(SPHERE))
         columns = _columns(posterior, mixture, there)
         smooth = Empirical(SMOOTH)
@@ -138,7 +138,7 @@ class OverSphere:
         own = [self.there.by_coefficients(effect) for effect in effects]
         return np.concatenate([self.there.linear * posterior.evidence.rows.lengths, *own], axis=1)
 
-    def _part(self, posterior: Posterior, cells: Components, at: HoldsAt) -> _OfPart:
+    def _part(self, posterior: Posterior, cells: Components, at: ReferenceEpoch) -> _OfPart:
         """Prediction of the part in the next recording. Contributions of single poses
         and of the previous pose are independent there."""
         if cells.part in self.of_part:
