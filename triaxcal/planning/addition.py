@@ -30,12 +30,12 @@ from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.design import (
     PLANS_CLOCK,
     VISIBLE,
-    Asked,
     OnPlansClock,
-    ask,
+    TargetEffects,
     channels_needed,
     combinations,
     profile_times,
+    target_effects,
 )
 from triaxcal.planning.optimal import profile
 from triaxcal.poses.covariates import channels_of
@@ -131,7 +131,7 @@ MOST = FULL
 
 
 @dataclass(frozen=True)
-class Had:
+class ExistingPoses:
     """The existing poses. ``up`` (n,3); ``weights`` (n,) 1/variance, 1 for a typical
     pose; ``held`` by channel and time (n,), each from −1 to 1 over its range, of
     which ``half`` is the half in the channel's unit; ``axes`` (3,3) the sensitive
@@ -165,38 +165,38 @@ class Addition:
     errors: Mapping[str, Mapping[str, float | None]]
 
 
-def additions(had: Had, asked: Asked, first: Sequence[Direction] = ()) -> list[Addition]:
+def additions(existing: ExistingPoses, targets: TargetEffects, first: Sequence[Direction] = ()) -> list[Addition]:
     """Poses of the 26 worth adding, best first: ``first`` those for the nine
     parameters, then those for the effects, until these are determined nearly as well
     as by a whole plan, or ``MOST`` are added.
 
     Each pose is the one with the largest information on the missing quantities.
     """
-    return _Adding(had, asked).run(first)
+    return _Adding(existing, targets).run(first)
 
 
 class _Adding:
-    def __init__(self, had: Had, asked: Asked) -> None:
-        self.had, self.asked = had, asked
-        self.channels = channels_needed(asked.effects)
-        self.step = 2 / max(len(had.up) - 1, 1)
-        self.rows = asked.rows(had.up, had.held)
-        self.scaled = asked.rows(had.up, self._in_units(had.held))
-        self.weights = had.weights
+    def __init__(self, existing: ExistingPoses, targets: TargetEffects) -> None:
+        self.existing, self.targets = existing, targets
+        self.channels = channels_needed(targets.effects)
+        self.step = 2 / max(len(existing.up) - 1, 1)
+        self.rows = targets.rows(existing.up, existing.held)
+        self.scaled = targets.rows(existing.up, self._in_units(existing.held))
+        self.weights = existing.weights
         self.out: list[Addition] = []
 
     def run(self, first: Sequence[Direction]) -> list[Addition]:
         for direction in first:
             self._add([direction])
-        limit = _as_a_whole_plan(self.asked)
-        while self.asked.rank and len(self.out) < MOST and not self._enough(limit):
+        limit = _as_a_whole_plan(self.targets)
+        while self.targets.rank and len(self.out) < MOST and not self._enough(limit):
             self._add(cube_directions())
         return self.out
 
     def _enough(self, limit: float) -> bool:
         _, singular, _ = np.linalg.svd(self.rows * np.sqrt(self.weights)[:, None])
         whole = len(self.rows) >= self.rows.shape[1] and singular[-1] > 1e-6 * singular[0]
-        return bool(whole and self.asked.worst(self.rows, self.weights) <= limit)
+        return bool(whole and self.targets.worst(self.rows, self.weights) <= limit)
 
     def _add(self, choice: Sequence[Direction]) -> None:
         """Add the best of these directions at the best levels."""
@@ -209,23 +209,23 @@ class _Adding:
             c: np.array([levels[c] for _, levels in options]) for c in self.channels
         }
         # The largest gain in information; ties go to the first.
-        rows = self.asked.rows(ups, held)
+        rows = self.targets.rows(ups, held)
         gain = self._gain(rows)
         at = int(np.argmax(gain >= gain.max() - 1e-6))
         (label, up), levels = options[at]
         self.rows = np.concatenate([self.rows, rows[at : at + 1]])
         self.weights = np.append(self.weights, 1.0)
         linear = self.rows[:, :LINEAR] * np.sqrt(self.weights)[:, None]
-        scaled = self.asked.rows(ups[at : at + 1], {n: v[at : at + 1] for n, v in self._in_units(held).items()})
+        scaled = self.targets.rows(ups[at : at + 1], {n: v[at : at + 1] for n, v in self._in_units(held).items()})
         self.scaled = np.concatenate([self.scaled, scaled])
         # Errors of all parameters with the pose added.
-        errors = self.asked.errors(self.scaled, self.weights)
-        ups = np.concatenate([self.had.up, *(a.up[None] for a in self.out), up[None]])
-        spread = dilution(ups, linear_design(ups, in_range(ups @ self.had.axes.T)))
+        errors = self.targets.errors(self.scaled, self.weights)
+        ups = np.concatenate([self.existing.up, *(a.up[None] for a in self.out), up[None]])
+        spread = dilution(ups, linear_design(ups, in_range(ups @ self.existing.axes.T)))
         self.out.append(Addition(label, up, levels, spread, worst_error(linear), errors))
 
     def _in_units(self, held: Mapping[str, Floats]) -> dict[str, Floats]:
-        return {name: v * self.had.half.get(name, 1.0) for name, v in held.items()}
+        return {name: v * self.existing.half.get(name, 1.0) for name, v in held.items()}
 
     def _gain(self, rows: Floats) -> Floats:
         """(C,) log factor of the determinant of the effects' information by each row:
@@ -234,16 +234,16 @@ class _Adding:
         whole = np.einsum("ci,ij,cj->c", rows, np.linalg.inv(M), rows)
         linear = rows[:, :LINEAR]
         part = np.einsum("ci,ij,cj->c", linear, np.linalg.inv(M[:LINEAR, :LINEAR]), linear)
-        return np.asarray(np.log1p(whole) - (np.log1p(part) if self.asked.rank else 0.0))
+        return np.asarray(np.log1p(whole) - (np.log1p(part) if self.targets.rank else 0.0))
 
 
-def _as_a_whole_plan(asked: Asked) -> float:
+def _as_a_whole_plan(targets: TargetEffects) -> float:
     """Largest allowed standard error of the combinations of coefficients, from a
     whole plan."""
     ups = np.array([v for _, v in directions(FULL)])
     ups = np.concatenate([ups, ups[:1]])
-    held = {TIME: profile_times(len(ups))} | profile(channels_needed(asked.effects), len(ups), 3)
-    return ENOUGH * asked.worst(asked.rows(ups, held))
+    held = {TIME: profile_times(len(ups))} | profile(channels_needed(targets.effects), len(ups), 3)
+    return ENOUGH * targets.worst(targets.rows(ups, held))
 
 
 @dataclass(frozen=True)
@@ -257,14 +257,14 @@ class ChannelRange:
 
 @dataclass(frozen=True)
 class MissingPoses:
-    """``had`` are the poses that carry a fit, None where they do not, ``dilution``
+    """``existing`` are the poses that carry a fit, None where they do not, ``dilution``
     that of the linear fit; ``wanted`` the additional poses; ``noise`` the standard
     error of a typical pose after the effects, relative to the reference; ``now`` the
     effects' standard errors without the additions, in that unit; ``absent`` the
     channels that the recording lacks; ``moves`` the ranges of the channels that have
     to change."""
 
-    had: Had | None
+    existing: ExistingPoses | None
     dilution: float | None
     wanted: list[Addition]
     noise: float | None
@@ -282,38 +282,45 @@ def missing_poses(
     absent = [c for c in channels_needed(asked_for) if c not in logged or not np.isfinite(logged[c]).all()]
     moves = dict.fromkeys(absent, ChannelRange())
     there = [e for e in asked_for if not set(e.needs) & set(absent)]
-    asked = ask(there)
-    if asked_for and not absent and asked.rank == 0:
+    targets = target_effects(there)
+    if asked_for and not absent and targets.rank == 0:
         raise Refused(f"|a| shows nothing of {', '.join(e.name for e in effects)} beside the nine parameters")
     try:
         linear = fit(poses, signs=signs, reference=reference)
     except Refused as e:
         where = dict(cube_directions())
         up, _ = rough_directions(poses, signs)
-        had = _had(up, np.ones(len(up)), poses if len(up) else [], moves, channels_needed(asked.effects))
+        existing = _existing(up, np.ones(len(up)), poses if len(up) else [], moves, channels_needed(targets.effects))
         labels = e.wanted or wanted_for(poses, signs)
-        wanted = additions(had, asked, [(label, where[label]) for label in labels])
+        wanted = additions(existing, targets, [(label, where[label]) for label in labels])
         return MissingPoses(None, None, wanted, None, {}, tuple(absent), moves)
     beside = fitted_beside(poses, there, signs=signs, reference=reference) if there else linear
-    had, noise = _had_of(beside, moves, channels_needed(asked.effects))
-    first = most_wanted(had.up, enough=ENOUGH, most=FULL, weights=had.weights)
-    now = asked.errors(asked.rows(had.up, {n: v * had.half.get(n, 1.0) for n, v in had.held.items()}), had.weights)
-    return MissingPoses(had, linear.dilution, additions(had, asked, first), noise, now, tuple(absent), moves)
+    existing, noise = _existing_of(beside, moves, channels_needed(targets.effects))
+    first = most_wanted(existing.up, enough=ENOUGH, most=FULL, weights=existing.weights)
+    now = targets.errors(
+        targets.rows(existing.up, {n: v * existing.half.get(n, 1.0) for n, v in existing.held.items()}),
+        existing.weights,
+    )
+    return MissingPoses(
+        existing, linear.dilution, additions(existing, targets, first), noise, now, tuple(absent), moves
+    )
 
 
-def _had_of(c: Calibration, moves: dict[str, ChannelRange], channels: Sequence[str]) -> tuple[Had, float | None]:
+def _existing_of(
+    c: Calibration, moves: dict[str, ChannelRange], channels: Sequence[str]
+) -> tuple[ExistingPoses, float | None]:
     used = [p for p in c.poses if p.used]
     error = noise_of(c)
     typical = None if error is None else float(np.sqrt(np.median(error**2)))
     weights = np.ones(len(used)) if error is None or typical is None else (typical / error) ** 2
     up = np.array([p.direction for p in used])
-    had = _had(up, weights, [p.pose for p in used], moves, channels)
-    return replace(had, axes=c.sensor.axes), None if typical is None else typical / c.reference
+    existing = _existing(up, weights, [p.pose for p in used], moves, channels)
+    return replace(existing, axes=c.sensor.axes), None if typical is None else typical / c.reference
 
 
-def _had(
+def _existing(
     up: Floats, weights: Floats, poses: Sequence[Pose], moves: dict[str, ChannelRange], channels: Sequence[str]
-) -> Had:
+) -> ExistingPoses:
     """Adds to ``moves`` the channels that stood still."""
     held: dict[str, Floats] = {c: np.zeros(len(up)) for c in channels} | {TIME: profile_times(len(up))}
     half = dict.fromkeys((*channels, TIME), 1.0)
@@ -326,4 +333,4 @@ def _had(
                 moves[name] = ChannelRange(float(values.min()), float(values.max()))
         elif name in channels:
             moves[name] = ChannelRange(float(values[0]), float(values[0]))
-    return Had(up, weights, held | {PLANS_CLOCK: held[TIME]}, half)
+    return ExistingPoses(up, weights, held | {PLANS_CLOCK: held[TIME]}, half)

@@ -46,7 +46,7 @@ def radial(effects: Sequence[Effect], a: Floats, held: Mapping[str, Floats]) -> 
 
 
 @dataclass(frozen=True)
-class Asked:
+class TargetEffects:
     """Target effects of a plan. ``seen`` (p,q): orthonormal combinations of their
     coefficients that |a| can show in addition to the nine parameters, ``hidden``
     (p,p−q) those that no plan can show, since they are equivalent to others."""
@@ -115,7 +115,7 @@ class Asked:
         return combined[bad].T[LINEAR:], (combined[~bad].T / values[~bad])[LINEAR:]
 
 
-def ask(effects: Sequence[Effect]) -> Asked:
+def target_effects(effects: Sequence[Effect]) -> TargetEffects:
     """The observable combinations of the effects, for free directions and
     covariates."""
     # Random directions and covariates, many enough for any effect.
@@ -124,7 +124,7 @@ def ask(effects: Sequence[Effect]) -> Asked:
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     held = {n: rng.uniform(-1, 1, len(a)) for n in (TIME, *channels_needed(effects))}
     seen, hidden = combinations(linear_design(a, a), radial(effects, a, held))
-    return Asked(tuple(effects), seen, hidden)
+    return TargetEffects(tuple(effects), seen, hidden)
 
 
 def combinations(nuisance: Floats, columns: Floats, least: float = SHOWS) -> tuple[Floats, Floats]:
@@ -197,7 +197,7 @@ def _clocks(time: Floats) -> dict[str, Floats]:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Observability:
     """Observability of one effect by a plan: ``visible`` of its ``of`` independent
     coefficients.
 
@@ -210,7 +210,7 @@ class Sight:
     hidden: tuple[Mapping[str, float], ...]
 
 
-def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Sight:
+def observability(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Observability:
     """Observability of a single effect by poses in these directions (n,3), in this
     order and evenly in time.
 
@@ -225,7 +225,7 @@ def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None 
     )
     names = [c.name for c in effect.coefficients]
     named = tuple({k: float(w) for k, w in zip(names, v, strict=True) if abs(w) > 1e-9} for v in _plainly(hidden.T))
-    return Sight(seen.shape[1], len(names), named)
+    return Observability(seen.shape[1], len(names), named)
 
 
 def _plainly(hidden: Floats) -> Floats:
@@ -250,5 +250,5 @@ def _plainly(hidden: Floats) -> Floats:
 def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
     """Names of the effects that poses in these directions (n,3) cannot show in full,
     with free channels."""
-    sights = [sight(directions, e) for e in catalogue]
-    return [e.name for e, s in zip(catalogue, sights, strict=True) if s.visible < s.of]
+    observabilities = [observability(directions, e) for e in catalogue]
+    return [e.name for e, s in zip(catalogue, observabilities, strict=True) if s.visible < s.of]

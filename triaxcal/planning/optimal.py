@@ -22,7 +22,7 @@ from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
 from triaxcal.model.directions import Direction, cube_directions, directions, in_order, linear_design, worst_error
 from triaxcal.model.sensor import LINEAR
-from triaxcal.planning.design import Asked, ask, channels_needed, needs_time, profile_times
+from triaxcal.planning.design import TargetEffects, channels_needed, needs_time, profile_times, target_effects
 
 WORSE_MOST = 1.5
 """Limit of the worst error of the nine parameters, relative to the plain plan of
@@ -55,7 +55,7 @@ class OptimalPlan:
 
     plan: tuple[Direction, ...]
     levels: Mapping[str, Floats]
-    asked: Asked
+    targets: TargetEffects
     efficiency: float
     errors: Mapping[str, Mapping[str, float | None]]
 
@@ -70,14 +70,14 @@ def optimal(count: int, effects: Sequence[Effect]) -> OptimalPlan:
 
     Raises Refused where |a| shows nothing of them, or where so few poses cannot.
     """
-    asked = ask(effects)
-    if asked.rank == 0:
+    targets = target_effects(effects)
+    if targets.rank == 0:
         raise Refused(f"|a| shows nothing of {_names(effects)} beside the nine parameters; no plan can")
-    most = _distinct_rank(asked)
-    if count < most or count + 1 < LINEAR + asked.rank:
-        least = max(most, LINEAR + asked.rank - 1)
+    most = _distinct_rank(targets)
+    if count < most or count + 1 < LINEAR + targets.rank:
+        least = max(most, LINEAR + targets.rank - 1)
         raise Refused(f"a plan of {count} poses cannot show {_names(effects)}; at least {least}")
-    search = _Search(count, asked)
+    search = _Search(count, targets)
     best = search.best(profile(channels_needed(effects), count + 1, search.levels_enough()))
     if not np.isfinite(best.value):
         raise Refused(f"a plan of {count} poses cannot show {_names(effects)}; take more")
@@ -88,10 +88,10 @@ def _names(effects: Sequence[Effect]) -> str:
     return ", ".join(e.name for e in effects)
 
 
-def _distinct_rank(asked: Asked) -> int:
+def _distinct_rank(targets: TargetEffects) -> int:
     """Least number of distinct directions: effects of direction alone need one for
     each combination."""
-    still = ask([e for e in asked.effects if not e.needs])
+    still = target_effects([e for e in targets.effects if not e.needs])
     return LINEAR + still.rank
 
 
@@ -123,8 +123,8 @@ class _Found:
 class _Search:
     """Exchange over slots: pose k has its time and its levels in any direction."""
 
-    def __init__(self, count: int, asked: Asked) -> None:
-        self.count, self.asked = count, asked
+    def __init__(self, count: int, targets: TargetEffects) -> None:
+        self.count, self.targets = count, targets
         self.ups, self.cube = candidates(1000)
         self.linear = linear_design(self.ups, self.ups)
         plain = np.array([v for _, v in directions(count)])
@@ -138,13 +138,13 @@ class _Search:
 
     def levels_enough(self) -> int:
         """The smallest number of levels within a hundredth of the best."""
-        if not channels_needed(self.asked.effects):
+        if not channels_needed(self.targets.effects):
             return LEVELS[0]
         values = []
         for levels in LEVELS:
-            tried = profile(channels_needed(self.asked.effects), self.count + 1, levels)
+            tried = profile(channels_needed(self.targets.effects), self.count + 1, levels)
             values.append(self._exchanged(tried, self._blocks(tried), self._start(0)).value)
-        return LEVELS[int(np.argmax(np.array(values) > max(values) - 0.01 * self.asked.rank))]
+        return LEVELS[int(np.argmax(np.array(values) > max(values) - 0.01 * self.targets.rank))]
 
     def best(self, levels: Mapping[str, Floats]) -> _Found:
         blocks = self._blocks(levels)
@@ -154,20 +154,20 @@ class _Search:
         best = max(found, key=lambda f: f.value)
         for bonus in (0.1, 0.03, 0.01):
             cubic = self._exchanged(levels, blocks, best.rows, bonus)
-            if cubic.value > best.value - CUBE_COSTS * self.asked.rank:
+            if cubic.value > best.value - CUBE_COSTS * self.targets.rank:
                 return cubic
         return best
 
     def _blocks(self, levels: Mapping[str, Floats]) -> list[Floats]:
         """Rows (C,9+q) of the candidates by slot; slots with equal covariates share
         them."""
-        timed = needs_time(self.asked.effects)
+        timed = needs_time(self.targets.effects)
         known: dict[tuple[float, ...], Floats] = {}
         out = []
         for k in range(self.count + 1):
             key = (float(self.times[k]) if timed else 0.0, *(float(v[k]) for v in levels.values()))
             if key not in known:
-                known[key] = self.asked.rows(self.ups, self.held(levels, k, len(self.ups)))
+                known[key] = self.targets.rows(self.ups, self.held(levels, k, len(self.ups)))
             out.append(known[key])
         return out
 
@@ -263,13 +263,13 @@ def candidates(least: int) -> tuple[Floats, Bools]:
 
 
 def _concluded(search: _Search, found: _Found) -> OptimalPlan:
-    asked, n = search.asked, search.count + 1
+    targets, n = search.targets, search.count + 1
     levels = dict(found.levels)
     rows, ups = found.rows, search.ups[found.rows]
     held = {TIME: search.times} | levels
-    value = information((X := asked.rows(ups, held)).T @ X)
+    value = information((X := targets.rows(ups, held)).T @ X)
     # Order the poses for short moves, unless time matters.
-    if not needs_time(asked.effects):
+    if not needs_time(targets.effects):
         kind = np.unique(np.stack([np.zeros(n), *levels.values()]), axis=1, return_inverse=True)[1].ravel()[:-1]
         order = in_order(ups[:-1], attached=X[:-1, LINEAR:], kind=kind)
         rows = rows[np.append(order, 0)]
@@ -277,17 +277,17 @@ def _concluded(search: _Search, found: _Found) -> OptimalPlan:
     names = {tuple(np.round(v, 9)): label for label, v in cube_directions()}
     labels = [names.get(tuple(np.round(v, 9)), f"N{k + 1}") for k, v in enumerate(ups)]
     labels[-1] = labels[0]
-    most = bound(asked, n)
+    most = bound(targets, n)
     return OptimalPlan(
         plan=tuple(zip(labels, ups, strict=True)),
         levels=levels,
-        asked=asked,
-        efficiency=float(np.exp(min(value - asked.rank * np.log(n) - most, 0.0) / asked.rank)),
-        errors=asked.errors(asked.rows(ups, held)),
+        targets=targets,
+        efficiency=float(np.exp(min(value - targets.rank * np.log(n) - most, 0.0) / targets.rank)),
+        errors=targets.errors(targets.rows(ups, held)),
     )
 
 
-def bound(asked: Asked, n: int) -> float:
+def bound(targets: TargetEffects, n: int) -> float:
     """Upper bound of `information` a pose, over all plans of ``n`` poses in time at
     any directions and levels.
 
@@ -297,15 +297,15 @@ def bound(asked: Asked, n: int) -> float:
     multiplicative algorithm (Silvey, Titterington and Torsney 1978).
     """
     # Grid of times, levels and directions.
-    times = profile_times(min(n, 41)) if needs_time(asked.effects) else np.zeros(1)
-    channels = channels_needed(asked.effects)
+    times = profile_times(min(n, 41)) if needs_time(targets.effects) else np.zeros(1)
+    channels = channels_needed(targets.effects)
     combined = list(itertools.product((-1.0, 0.0, 1.0) if len(channels) < 3 else (-1.0, 1.0), repeat=len(channels)))
     many = len(times) * len(combined) > 30
     coarse, fine = candidates(90 if many else 250)[0], candidates(250 if many else 1000)[0]
 
     def rows(ups: Floats, t: float) -> Floats:
         blocks = [
-            asked.rows(
+            targets.rows(
                 ups, {TIME: np.full(len(ups), t)} | {c: np.full(len(ups), v) for c, v in zip(channels, at, strict=True)}
             )
             for at in combined
@@ -329,7 +329,7 @@ def bound(asked: Asked, n: int) -> float:
     # The bound at the resulting design, with a finer grid of directions.
     M = information_of(weights)
     largest = [float(_variance(M, rows(fine, t)).max()) for t in times]
-    return information(M) + max(float(np.mean(largest)) - asked.rank, 0.0)
+    return information(M) + max(float(np.mean(largest)) - targets.rank, 0.0)
 
 
 def _variance(M: Floats, X: Floats) -> Floats:
