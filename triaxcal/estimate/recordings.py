@@ -29,7 +29,7 @@ POSES_A_COEFFICIENT = 4.0
 """A form has at most one coefficient of a run for so many of its poses."""
 
 
-def together(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
+def gather(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
     """The poses of several recordings of one unit, in that order, each with its
     `Run`. One recording's as they are.
 

@@ -154,7 +154,7 @@ class ExistingPoses:
 class Addition:
     """One additional pose. ``levels`` of the channels, −1 lowest to 1 highest;
     ``dilution``, ``worst_error`` of the nine parameters and ``errors``
-    (`Asked.errors`, per unit of the channels) include this pose and all previous
+    (`TargetEffects.errors`, per unit of the channels) include this pose and all previous
     ones."""
 
     label: str

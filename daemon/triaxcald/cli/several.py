@@ -11,7 +11,7 @@ from pathlib import Path
 
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
-from triaxcal.estimate.recordings import residuals_by_run, shape_by_poses, shape_of, together
+from triaxcal.estimate.recordings import gather, residuals_by_run, shape_by_poses, shape_of
 from triaxcal.number_format import plain
 from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
@@ -76,7 +76,7 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
     return replace(
         first,
         name=f"{first.name} and {len(recordings) - 1} more",
-        poses=together([m.poses for m in recordings]),
+        poses=gather([m.poses for m in recordings]),
         windows=None,
         unconfirmed=first.unconfirmed if all(m.unconfirmed for m in recordings) else "",
         data_quality=[line for m in recordings for line in named_quality(m)],
