@@ -154,8 +154,8 @@ class ExistingPoses:
 class Addition:
     """One additional pose. ``levels`` of the channels, −1 lowest to 1 highest;
     ``dilution``, ``worst_error`` of the nine parameters and ``errors``
-    (`TargetEffects.errors`, per unit of the channels) include this pose and all previous
-    ones."""
+    (`TargetEffects.errors`, per unit of the channels) include this pose and all
+    previous ones."""
 
     label: str
     up: Floats

@@ -50,8 +50,8 @@ used."""
 class OptimalPlan:
     """``plan`` in order, its first pose repeated at the end; ``levels`` (n,) of each
     channel from −1, its lowest, to 1. ``efficiency`` 0…1 relative to a bound on any
-    plan; ``errors`` as `TargetEffects.errors`, a channel in halves of its range and time in
-    halves of the plan's."""
+    plan; ``errors`` as `TargetEffects.errors`, a channel in halves of its range and
+    time in halves of the plan's."""
 
     plan: tuple[Direction, ...]
     levels: Mapping[str, Floats]

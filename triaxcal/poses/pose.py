@@ -13,7 +13,7 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses.noise_spectrum import NoiseLevels
 from triaxcal.poses.pose_noise import noise_of_means
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.shaken import LOUD
+from triaxcal.poses.stillness.vibration import VIBRATING
 from triaxcal.poses.stillness.windows import Windows, resolution
 
 # The time course of a logged channel about the middle of a pose: rate and bend,
@@ -96,7 +96,7 @@ class PoseStart:
 
 
 @dataclass(frozen=True)
-class ShakenPart:
+class VibrationPart:
     """A stretch of time under vibration with a ``scatter`` (standard deviation of a
     sample, axis with the largest, output units), so many ``times`` that of the rest
     of the pose."""
@@ -156,7 +156,7 @@ class Pose:
     noise_levels: NoiseLevels | None = field(default=None, repr=False, compare=False)
     run: Run = field(default_factory=Run)
     fault: str = ""
-    shaken: tuple[ShakenPart, ...] = ()
+    shaken: tuple[VibrationPart, ...] = ()
     restless: float = 1.0
     parted: bool = False
 
@@ -267,7 +267,7 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             bend_errors={name: course.bend_error for name, course in courses[i].items()},
             before=held[i - 1].mean if i else None,
             scatter=w.variance[s.used].mean(axis=0) * (w.size - 1) / w.size + w.mean[s.used].var(axis=0),
-            shaken=_shaken_parts(w, s),
+            shaken=_vibration_parts(w, s),
             restless=float(noise.restless[i]),
             parted=s.parted,
         )
@@ -275,16 +275,16 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
     ]
 
 
-def _shaken_parts(w: Windows, s: Span) -> tuple[ShakenPart, ...]:
-    if not len(s.shaken):
+def _vibration_parts(w: Windows, s: Span) -> tuple[VibrationPart, ...]:
+    if not len(s.vibrating):
         return ()
     begin, usual = int(w.start_ns[0]), np.maximum(w.variance[s.used].mean(axis=0), resolution(w) ** 2 / 12)
     parts = []
-    for at in np.split(s.shaken, np.flatnonzero(np.diff(s.shaken) > 1) + 1):
+    for at in np.split(s.vibrating, np.flatnonzero(np.diff(s.vibrating) > 1) + 1):
         start_s, end_s = (int(w.start_ns[at[0]]) - begin) * 1e-9, (int(w.end_ns[at[-1]]) - begin) * 1e-9
-        loud = (w.variance[at] > LOUD**2 * usual).any(axis=1)
-        variance = w.variance[at[loud] if loud.any() else at].mean(axis=0)
+        strong = (w.variance[at] > VIBRATING**2 * usual).any(axis=1)
+        variance = w.variance[at[strong] if strong.any() else at].mean(axis=0)
         axis = int(np.argmax(variance / usual))
         scatter, times = np.sqrt(variance[axis]), np.sqrt(variance[axis] / usual[axis])
-        parts.append(ShakenPart(start_s, end_s, float(scatter), float(times)))
+        parts.append(VibrationPart(start_s, end_s, float(scatter), float(times)))
     return tuple(parts)

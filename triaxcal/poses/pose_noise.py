@@ -34,7 +34,7 @@ tone is too little to detect it against."""
 TONES_MOST = 6
 """Each tone takes three degrees of freedom: so many leave a quarter of those of the
 shortest pose."""
-LOUD = 30.0
+PROMINENT = 30.0
 """Ratio of a tone's power to the median power at neighbouring frequencies; noise
 exceeds it in one pose of two hundred."""
 ABOUT = 8
@@ -64,7 +64,7 @@ def without_tones(track: Track) -> Cleaned:
     if len(track) < WINDOWS_LEAST:
         return Cleaned(track, variance)
     # Strongest tone, its frequency refined, fitted with a straight line and subtracted.
-    while tones < TONES_MOST and (found := _loudest(track, left)) is not None:
+    while tones < TONES_MOST and (found := _strongest(track, left)) is not None:
         frequency = _refined(track, left[:, found[1]], found[0])
         sines, coefficients = _fitted(track, left, frequency)
         left = left - sines @ coefficients
@@ -100,7 +100,7 @@ def _refined(track: Track, deviation: Floats, frequency: float) -> float:
     return frequency + float(np.clip(step, -0.5 / track.length, 0.5 / track.length))
 
 
-def _loudest(track: Track, deviation: Floats) -> tuple[float, int] | None:
+def _strongest(track: Track, deviation: Floats) -> tuple[float, int] | None:
     """Frequency in cycles a window, and column, of the strongest peak over the
     background; None where no peak exceeds it enough."""
     # Hann-tapered, zero-padded power spectrum, with gaps as zeros.
@@ -117,7 +117,7 @@ def _loudest(track: Track, deviation: Floats) -> tuple[float, int] | None:
     if last <= first:
         return None
     peak = first + int(np.argmax(ratio[first:last]))
-    if ratio[peak] < LOUD:
+    if ratio[peak] < PROMINENT:
         return None
     column = int(np.argmax(power[peak] / np.maximum(usual[peak], 1e-300)))
     # Interpolate the peak by a parabola through the logarithms of three bins.
@@ -300,8 +300,8 @@ class _Model:
         # Restless poses: level of the slowest ordinates, where this is larger.
         if restless.any():
             slow, slow_dof = power.heard(expected, used * power.slowest[:, None])
-            louder = restless[:, None] & (slow > scale)
-            scale, scale_dof = np.where(louder, slow, scale), np.where(louder, slow_dof, scale_dof)
+            stronger = restless[:, None] & (slow > scale)
+            scale, scale_dof = np.where(stronger, slow, scale), np.where(stronger, slow_dof, scale_dof)
         return cls(spectrum, scale, scale_dof, own, dof, restless)
 
     def mean_variance(self, tracks: Sequence[Track]) -> Floats:
@@ -417,7 +417,7 @@ LONGEST = 2**17
 half a gigabyte."""
 SHORTEST = 64
 """Smallest number of windows, or averages, that the shortest pose keeps."""
-SHAKEN, QUIET = 2.0, 0.1
+VIBRATING, QUIETEST_SHARE = 2.0, 0.1
 """A pose is vibrating where its outputs have so many times the variance of the
 quietest tenth of the poses."""
 
@@ -535,7 +535,7 @@ def _along(
     scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans]) + resolution(w) ** 2 / 12
     # Where a machine shakes the stand, the scatter is mostly the machine's, which a
     # window averages out.
-    scatter = np.minimum(scatter, SHAKEN * np.quantile(scatter, QUIET, axis=0))
+    scatter = np.minimum(scatter, VIBRATING * np.quantile(scatter, QUIETEST_SHARE, axis=0))
     # Predicted standard deviation √(gᵀ Σ g) of a window mean along the vector.
     inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
     predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))
@@ -559,6 +559,6 @@ def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
     scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans])
     # Half-way between two steps readings have a variance of a quarter.
     usual = np.maximum(np.median(scatter, axis=0), resolution(w) ** 2 / 4)
-    quiet = np.asarray((scatter <= SHAKEN * usual).all(axis=1))
+    quiet = np.asarray((scatter <= VIBRATING * usual).all(axis=1))
     quiet |= not quiet.any()
     return left_in_means(w, scatter[quiet], np.array([len(s.used) for s in spans])[quiet])

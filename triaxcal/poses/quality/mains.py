@@ -54,7 +54,7 @@ beside it too."""
 OUTLYING = 4.0
 """Standard deviations above the noise beside a band: bins beyond hold a line of
 their own."""
-LOUD = 4.0  # over the median level: a machine was on, or somebody knocked
+STRONG = 4.0  # over the median level: a machine was on, or somebody knocked
 KNOCK = 12.0
 """Segments this much louder than most are left out, and bins of a single one
 count no more than this: knocks."""
@@ -190,7 +190,7 @@ class Spectra:
         bin_hz = 1e9 / self.period_ns / self.size
         for axis in range(3):
             level = np.median(power[:, axis, band.flank], axis=1)
-            sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < LOUD * np.median(level))
+            sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < STRONG * np.median(level))
             if sound.sum() < SEGMENTS_LEAST:
                 continue
             # One level for all: a bin over its own segment's level is small

@@ -6,7 +6,7 @@ shows in the difference of neighbouring averages over one or more windows, compa
 with the scatter of such differences in this stream, whatever the colour of its noise.
 The remaining runs are trimmed where a move begins or settles, and joined where only a
 bump separates them. Where a machine shakes the stand,
-`triaxcal.poses.stillness.shaken` finds the remaining poses.
+`triaxcal.poses.stillness.vibration` finds the remaining poses.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from triaxcal.poses.stillness.noise_scales import (
     trimmed,
     unbroken,
 )
-from triaxcal.poses.stillness.shaken import (
+from triaxcal.poses.stillness.vibration import (
     ALONE_S,
     MOVE_SIGMA,
     disturbances,
     parted,
     runs,
-    shaken_noise,
-    shaken_runs,
+    vibrating_runs,
+    vibration_noise,
     worth_keeping,
 )
 from triaxcal.poses.stillness.windows import RATE_LEAST, Rounding, WindowCutter, Windows, resolution, window_size
@@ -58,12 +58,12 @@ it. A lost pose costs its data; a pause that is taken for a pose puts the accele
 of the turn into it."""
 
 
-def without_turns(w: Windows, quiet: list[Ints], shaken: list[Ints]) -> list[Ints]:
+def without_turns(w: Windows, quiet: list[Ints], vibrating: list[Ints]) -> list[Ints]:
     """Still pieces in order of time, without those between quiet pieces that belong
     to an in-place rotation."""
     # Group the pieces by place; within a place, drop pieces between quiet ones.
     known = {int(piece[0]) for piece in quiet}
-    pieces = sorted([*quiet, *shaken], key=lambda p: int(p[0]))
+    pieces = sorted([*quiet, *vibrating], key=lambda p: int(p[0]))
     kept: list[Ints] = []
     for place in _places(w, pieces):
         at = [k for k, piece in enumerate(place) if int(piece[0]) in known]
@@ -125,14 +125,14 @@ class Span:
     """A still span as indices of windows. ``used`` (k,) are its undisturbed windows.
 
     ``since_s`` is the duration of the disturbance before it, where this left the mean
-    unchanged; else infinite. ``shaken`` (j,) are the windows of its disturbances,
+    unchanged; else infinite. ``vibrating`` (j,) are the windows of its disturbances,
     none of them in ``used``. ``parted``: a move hidden by vibration lies between this
     span and the previous one.
     """
 
     used: Ints
     since_s: float = math.inf
-    shaken: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    vibrating: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     parted: bool = False
 
     @property
@@ -220,13 +220,13 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
         found, noise, steady = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
     # Quiet pieces, then vibrating pieces in the rest of the stream.
     taken, pieces = _quiet_pieces(w, found, noise)
-    shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
+    vibrating = vibrating_runs(w, [*taken, *runs(stuck, w.joined)], noise)
     disturbed = ~steady
     # Separate in-place rotations, or keep all pieces.
     if turn_s is None:
-        kept, longest = sorted([*pieces, *shaken], key=lambda p: int(p[0])), REJOIN_S
+        kept, longest = sorted([*pieces, *vibrating], key=lambda p: int(p[0])), REJOIN_S
     else:
-        kept, longest = without_turns(w, pieces, shaken), turn_s
+        kept, longest = without_turns(w, pieces, vibrating), turn_s
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
     # Join pieces of one pose, then split poses that hide a move.
@@ -238,14 +238,14 @@ def _spans_of(w: Windows, pose: list[Ints], quiet: Bools, noise: NoiseScales, si
     """The sufficiently long spans of one pose: several where vibration hid a move."""
     spans: list[Span] = []
     for part in parted(w, pose, [bool(quiet[p[0]]) for p in pose], noise):
-        used, shaken = _without_shaken(w, part, quiet, noise)
+        used, vibrating = _without_vibration(w, part, quiet, noise)
         if _long_enough(w, used, SPAN_LEAST_S if quiet[used].any() else ALONE_S):
-            disturbed = disturbances(w, used, shaken)
+            disturbed = disturbances(w, used, vibrating)
             spans.append(Span(used, math.inf if spans else since_s, disturbed, parted=bool(spans)))
     return spans
 
 
-def _without_shaken(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScales) -> tuple[Ints, Ints]:
+def _without_vibration(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScales) -> tuple[Ints, Ints]:
     """The windows that enter the mean of a pose, and the vibrating ones that would
     make it worse."""
     still = [p for p in part if quiet[p[0]]]
@@ -253,9 +253,9 @@ def _without_shaken(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScal
         return np.concatenate(part), np.zeros(0, dtype=np.int64)
     known = np.concatenate(still)
     kept = [bool(quiet[p[0]]) or worth_keeping(w, p, known, noise) for p in part]
-    shaken = [p for p, k in zip(part, kept, strict=True) if not k]
+    vibrating = [p for p, k in zip(part, kept, strict=True) if not k]
     used = [p for p, k in zip(part, kept, strict=True) if k]
-    return np.concatenate(used), np.concatenate([np.zeros(0, dtype=np.int64), *shaken])
+    return np.concatenate(used), np.concatenate([np.zeros(0, dtype=np.int64), *vibrating])
 
 
 def _rounding(step: Floats, quiet: Floats) -> Rounding:
@@ -498,7 +498,7 @@ def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> boo
     here, there = before[-scale:], after[:scale]
     apart = np.abs(w.mean[here].mean(axis=0) - w.mean[there].mean(axis=0))
     level = w.variance[np.concatenate([here, there])].mean(axis=0)
-    return bool((apart <= MOVE_SIGMA * shaken_noise(noise, level, w.size).step[scale]).all())
+    return bool((apart <= MOVE_SIGMA * vibration_noise(noise, level, w.size).step[scale]).all())
 
 
 def _long_enough(w: Windows, used: Ints, least_s: float) -> bool:

@@ -216,7 +216,7 @@ def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
         change -= np.clip(change, np.minimum(crept, 0), np.maximum(crept, 0))
         if (np.abs(change) > EDGE_SIGMA * noise.of_edge(scale, before)).any():
             return scale
-        louder = float(share[-scale:].mean() - usual)
-        if n >= 12 and louder > EDGE_SIGMA * spread * np.sqrt(1 / scale + 2 / n):
+        excess = float(share[-scale:].mean() - usual)
+        if n >= 12 and excess > EDGE_SIGMA * spread * np.sqrt(1 / scale + 2 / n):
             return scale
     return 0

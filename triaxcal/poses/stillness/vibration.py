@@ -46,7 +46,7 @@ SHARE = 0.03
 """Largest scatter under vibration as a share of the range of the poses."""
 
 
-def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
+def vibration_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
     """Noise of averages over windows of ``size`` samples with the ``variance`` (3,),
     where this exceeds the quiet noise."""
     excess = np.maximum(variance - noise.scatter**2, 0.0)
@@ -63,7 +63,7 @@ def _share(scale: int, size: int) -> float:
     return 2 / (size * scale) + (TONE / scale) ** 2
 
 
-def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
+def vibrating_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
     """Trimmed runs with a constant mean, among the windows outside the quiet runs
     ``taken``.
 
@@ -90,7 +90,7 @@ def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]
         even = np.asarray(((level[run] < UNEVEN * usual) & (w.variance[run] < UNEVEN**2 * usual)).all(axis=1))
         for part in runs(even, np.ones(len(run), dtype=bool)):
             part = run[part]
-            piece = trimmed(w, part, shaken_noise(noise, w.variance[part].mean(axis=0), w.size))
+            piece = trimmed(w, part, vibration_noise(noise, w.variance[part].mean(axis=0), w.size))
             if len(piece) and (w.end_ns[piece[-1]] - w.start_ns[piece[0]]) * 1e-9 >= LEAST_S:
                 found.append(piece)
     return found
@@ -135,7 +135,7 @@ def runs(still: Bools, joined: Bools) -> list[Ints]:
 
 MUCH = 9.0
 """In variances of the quiet part: a smaller excess is not reported."""
-LOUD = 3.0
+VIBRATING = 3.0
 """In usual scatters: a window with more counts as vibrating."""
 LASTING_S = 0.45
 """Duration of vibrating windows that distinguishes a disturbance from a knock: half a
@@ -181,7 +181,7 @@ def _climb(w: Windows, *pieces: Ints) -> Floats:
     return np.asarray(np.concatenate(x) @ np.concatenate(u) / sum(float(i @ i) for i in x))
 
 
-def worth_keeping(w: Windows, shaken: Ints, quiet: Ints, noise: NoiseScales) -> bool:
+def worth_keeping(w: Windows, vibrating: Ints, quiet: Ints, noise: NoiseScales) -> bool:
     """Whether the mean over both parts of a pose is better than that over the
     ``quiet`` windows, or hardly worse.
 
@@ -189,17 +189,18 @@ def worth_keeping(w: Windows, shaken: Ints, quiet: Ints, noise: NoiseScales) -> 
     of m if its v is below 2 + n/m times the other's.
     """
     usual = np.maximum(SCALES[-1] * noise.step[SCALES[-1]] ** 2 / 2, _spread(w, quiet))
-    return bool(np.mean(_spread(w, shaken) / usual) < max(MUCH, 2 + len(shaken) / len(quiet)))
+    return bool(np.mean(_spread(w, vibrating) / usual) < max(MUCH, 2 + len(vibrating) / len(quiet)))
 
 
-def disturbances(w: Windows, used: Ints, shaken: Ints) -> Ints:
-    """(j,) windows of a pose's disturbances, none of them in ``used``: its ``shaken``
-    parts with the windows next to them, and bumps longer than a knock."""
-    without = np.union1d(np.setdiff1d(np.arange(used[0], used[-1] + 1), used), shaken)
-    loud = (w.variance[without] > LOUD**2 * w.variance[used].mean(axis=0)).any(axis=1)
+def disturbances(w: Windows, used: Ints, vibrating: Ints) -> Ints:
+    """(j,) windows of a pose's disturbances, none of them in ``used``: its
+    ``vibrating`` parts with the windows next to them, and bumps longer than a
+    knock."""
+    without = np.union1d(np.setdiff1d(np.arange(used[0], used[-1] + 1), used), vibrating)
+    strong = (w.variance[without] > VIBRATING**2 * w.variance[used].mean(axis=0)).any(axis=1)
     least = LASTING_S / (w.period_ns * 1e-9)
     parts = np.split(np.arange(len(without)), np.flatnonzero(np.diff(without) > 1) + 1)
-    lasting = [without[p] for p in parts if loud[p].sum() >= least or np.isin(without[p], shaken).any()]
+    lasting = [without[p] for p in parts if strong[p].sum() >= least or np.isin(without[p], vibrating).any()]
     return np.concatenate([np.zeros(0, dtype=np.int64), *lasting])
 
 
