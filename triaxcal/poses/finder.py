@@ -7,7 +7,7 @@ from typing import Any
 
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
-from triaxcal.poses.quality import QualityDetector, QualityFinding, untrusted_poses
+from triaxcal.poses.quality import QualityDetector, QualityFinding, faulty_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector
 from triaxcal.poses.stillness.windows import Windows
 
@@ -67,7 +67,7 @@ class PoseFinder:
         windows = self.windows
         if windows is None:
             return []
-        return poses_of(windows, self.spans(), untrusted_poses(self.findings()) if judged else None)
+        return poses_of(windows, self.spans(), faulty_poses(self.findings()) if judged else None)
 
     def spans(self) -> list[Span]:
         """The still spans so far, cached for the same windows."""

@@ -2,6 +2,6 @@
 outputs, gaps, mains, coarse steps."""
 
 from triaxcal.poses.quality.detector import QualityDetector, disturbances
-from triaxcal.poses.quality.finding import QualityFinding, untrusted_poses
+from triaxcal.poses.quality.finding import QualityFinding, faulty_poses
 
-__all__ = ["QualityDetector", "QualityFinding", "disturbances", "untrusted_poses"]
+__all__ = ["QualityDetector", "QualityFinding", "disturbances", "faulty_poses"]

@@ -14,7 +14,7 @@ from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import Windows
 
 AXES = "xyz"
-UNTRUSTED = ("saturation", "stuck_output")
+INVALIDATING = ("saturation", "stuck_output")
 """Faults with which a mean does not follow the acceleration."""
 
 
@@ -191,10 +191,10 @@ class MergedPoses(QualityFinding):
     moves: tuple[Move, ...]
 
 
-def untrusted_poses(findings: Iterable[QualityFinding]) -> dict[int, str]:
+def faulty_poses(findings: Iterable[QualityFinding]) -> dict[int, str]:
     """By index, the still spans in which the outputs do not follow the
     acceleration, with the name of the fault."""
-    return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
+    return {i: f.name for f in findings if f.name in INVALIDATING for i in f.poses}
 
 
 @dataclass(frozen=True)
