@@ -30,7 +30,7 @@ from triaxcal.evidence.search import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
-from triaxcal.progress import Progress, Stage, untold
+from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
@@ -205,7 +205,7 @@ def diagnose(
     catalogue: Sequence[Effect] | None = None,
     at: Moment | float = Moment.END,
     odds: Odds | None = None,
-    progress: Progress = untold,
+    progress: Progress = unreported,
 ) -> Loop:
     """Find and correct the effects that still poses show beyond the linear
     model.
@@ -281,23 +281,23 @@ class _Report:
     def finding(self, named: Named, refused: Refusal | None) -> Finding:
         probabilities = named.probabilities
         name, *others = probabilities
-        told = stated(self.found, probabilities)
+        calibrated = stated(self.found, probabilities)
         adopted = not others and refused is None
         coefficients, remedy = self._of(self.after, name) if adopted else self.if_it_acts(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
-            probability=told[name],
-            alternatives={other: told[other] for other in others},
+            probability=calibrated[name],
+            alternatives={other: calibrated[other] for other in others},
             coefficients=coefficients,
             remedy=remedy,
             together=named.together,
         )
 
     def candidate(self, name: str, probability: float) -> Candidate:
-        told = stated(self.found, {name: probability})[name]
+        calibrated = stated(self.found, {name: probability})[name]
         hangs = self.posterior.evidence.odds.hangs_on_one_pose(probability)
-        return Candidate(name, told, self.if_it_acts(name)[0], hangs)
+        return Candidate(name, calibrated, self.if_it_acts(name)[0], hangs)
 
     def if_it_acts(self, name: str) -> tuple[Coefficients, str]:
         made = average(self.posterior.conditional_on(name), self.moment)

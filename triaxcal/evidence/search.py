@@ -26,7 +26,7 @@ from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
-from triaxcal.progress import Progress, Stage, untold
+from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 
 # One unit's evidence with a further term and without a name: the factors of the
@@ -113,14 +113,14 @@ NO_PART = 1e-3
 """Parts with a smaller share in every leading set are neglected."""
 
 
-def likely_sets(evidence: Evidence, told: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
-    """The sets within Occam's window, the best first, and the empty set. ``told`` is
+def likely_sets(evidence: Evidence, report: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
+    """The sets within Occam's window, the best first, and the empty set. ``report`` is
     called with the approximate share of the work that is done."""
     # Evidence of the empty set and of each single term, summed over parts and sizes.
     singles = []
     for part in range(len(evidence.parts)):
         singles.append(evidence.log_evidence_with_each(part))
-        told(SINGLES * part / len(evidence.parts))
+        report(SINGLES * part / len(evidence.parts))
     of_each = log_sum_exp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
     level: Scores = {(i,): float(score) for i, score in enumerate(of_each)}
     scores: Scores = {(): float(log_sum_exp([alone for _, alone in singles]))} | level
@@ -128,7 +128,7 @@ def likely_sets(evidence: Evidence, told: Callable[[float], None] = lambda done:
     for depth in range(1, evidence.odds.together):
         level = _grown(evidence, level, depth)
         scores |= level
-        told(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
+        report(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
     # Keep the sets within the window of the best.
     window = max(scores.values()) - np.log(evidence.odds.window)
     ranked = sorted(scores, key=lambda members: -scores[members])
@@ -220,7 +220,7 @@ def posterior_of(
     signs: Sequence[float] = (1, 1, 1),
     catalogue: Sequence[Effect] | None = None,
     odds: Odds | None = None,
-    progress: Progress = untold,
+    progress: Progress = unreported,
 ) -> Posterior:
     """The posterior of effects, outliers and unmodelled parts, conditional on the
     ``linear`` fit of these poses."""
@@ -231,14 +231,14 @@ def posterior_of(
     suspects: list[int] | None = None
     done = 0
 
-    def told(share: float) -> None:
+    def report(share: float) -> None:
         progress(Stage.EFFECTS, (done + share) / ROUNDS)
 
     while True:
-        told(0.0)
+        report(0.0)
         # Terms, their evidence, and the likely sets about the present point.
         evidence = Evidence(rows, terms_of(rows, effects, odds, finer, near), odds, suspects)
-        posterior = Posterior(evidence, likely_sets(evidence, told))
+        posterior = Posterior(evidence, likely_sets(evidence, report))
         done += 1
         # Next point, finer shapes, change points and suspects; stop when nothing
         # changes.
