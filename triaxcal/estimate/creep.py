@@ -45,21 +45,24 @@ def with_unexplained_creep(poses: Sequence[Pose], model: Calibration, *, elsewhe
     except EffectFault:  # known in the middle of the poses alone
         return list(poses)
     # Keep the unexplained part, and only where it is smaller than the whole.
-    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, covariates), strict=True)]
+    left = [
+        _unexplained_creep(p.creep, c, g)
+        for p, c, g in zip(poses, change, _outward(poses, model, covariates), strict=True)
+    ]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
         for p, rest in zip(poses, left, strict=True)
     ]
 
 
-def _beside(creep: Floats, change: Floats, outward: Floats) -> Floats:
+def _unexplained_creep(creep: Floats, change: Floats, outward: Floats) -> Floats:
     """The part of a pose's creep that ``change`` does not explain. Where a pose only
     turns and its |a| stays within the noise, only the rotation counts as creep
     (`triaxcal.poses.pose`), and only that part is returned."""
     # Project out the radial part where the creep itself has none.
     left = creep - change
-    turns = abs(creep @ outward) <= ASLANT * np.linalg.norm(creep)
-    return np.asarray(left - (left @ outward) * outward if turns else left)
+    rotates = abs(creep @ outward) <= ASLANT * np.linalg.norm(creep)
+    return np.asarray(left - (left @ outward) * outward if rotates else left)
 
 
 def _outward(poses: Sequence[Pose], model: Calibration, covariates: Mapping[str, Floats]) -> Floats:

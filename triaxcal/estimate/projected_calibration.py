@@ -73,7 +73,7 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
         thermal=None if c.thermal is None else through @ c.thermal @ through.T,
         prior_sd=None if c.prior_sd is None else c.prior_sd[own[9:]],
         weights={name: p for name, p in c.weights.items() if name in names},
-        unmodelled=_beside(c, sensor, through, u, covariates),
+        unmodelled=_unmodelled(c, sensor, through, u, covariates),
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
         update=None if c.update is None else _update(c.update, through),
     )
@@ -84,7 +84,9 @@ def _update(update: BiasUpdate, through: Floats) -> BiasUpdate:
     return replace(update, covariances={n: through @ v @ through.T for n, v in update.covariances.items()})
 
 
-def _beside(c: Calibration, sensor: Sensor, through: Floats, u: Floats, covariates: Mapping[str, Floats]) -> Unmodelled:
+def _unmodelled(
+    c: Calibration, sensor: Sensor, through: Floats, u: Floats, covariates: Mapping[str, Floats]
+) -> Unmodelled:
     """Unmodelled error of the projected calibration: that of the whole one, and
     the difference of the components across the measured vector, which no fit of
     |a| can compensate."""

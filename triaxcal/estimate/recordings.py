@@ -172,7 +172,7 @@ def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: flo
     return shape_of(found) if sum(p.used for p in found.poses) >= POSES_LEAST else None
 
 
-def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
+def shape_without_effects(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
     """The shape from these poses after subtraction of the effects of ``held``."""
     sensor = held.sensor
     if sensor.effects:

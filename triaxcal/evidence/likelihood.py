@@ -121,7 +121,7 @@ class WeightedData:
         whole = whole - np.concatenate([taken @ self.along.T, taken @ self.precision.axes.T], axis=1)
         return np.asarray(factor[places][:, None] * whole[:, place] * factor)
 
-    def beside(self, places: Ints, scale: Floats) -> ConditionalData:
+    def conditional_on(self, places: Ints, scale: Floats) -> ConditionalData:
         """The data conditional on coefficients at these places (q,), each with a
         normal prior of standard deviation ``scale``. Combinations that the data
         determine no better than rounding keep their prior."""
@@ -353,7 +353,7 @@ class Evidence:
     def _conditional_on(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> ConditionalData:
         """The data under a part, conditional on ``members`` of these sizes."""
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
-        return self._data[part].beside(self.places(members), scale)
+        return self._data[part].conditional_on(self.places(members), scale)
 
     def with_each_further(self, found: SetEvidence, row: int) -> Floats:
         """Approximate log evidence (T,R) of a set with each further term at each

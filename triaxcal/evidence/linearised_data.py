@@ -88,7 +88,7 @@ class LinearisedData:
         r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
         if len(r) <= LINEAR:
             raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
-        error = np.concatenate([_not_too_quiet(error[:n]), _not_too_quiet(error[n:])])
+        error = np.concatenate([_floored(error[:n]), _floored(error[n:])])
         # Divide by the errors, scale the columns, and project the misfits.
         columns = J / error[:, None]
         lengths = np.linalg.norm(columns, axis=0)
@@ -232,5 +232,5 @@ def span(columns: Floats) -> Floats:
     return np.asarray(axes[:, size > max(columns.shape) * np.finfo(float).eps * size[0]])
 
 
-def _not_too_quiet(error: Floats) -> Floats:
+def _floored(error: Floats) -> Floats:
     return np.maximum(error, QUIETEST * np.median(error)) if len(error) else error

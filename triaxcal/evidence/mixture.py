@@ -171,7 +171,7 @@ class Projection:
         columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
         return cls(tuple(likeliest), columns, by_term)
 
-    def beside(self, posterior: Posterior, effect: Effect) -> Projection:
+    def with_effect(self, posterior: Posterior, effect: Effect) -> Projection:
         """The same projection with a further effect, onto which no term is
         projected."""
         own = posterior.evidence.rows.by_coefficients(effect)

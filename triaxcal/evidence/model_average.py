@@ -281,7 +281,7 @@ def _smooth(posterior: Posterior, sphere: OverSphere, at: ReferenceEpoch, mixtur
     projection = Projection.of(posterior, at, [e for e in _likeliest(posterior) if not e.needs])
     coefficients = _mean(posterior, projection)[0][LINEAR:]
     further = smooth_mean(posterior, mixture, projection, sphere)
-    projection, coefficients = projection.beside(posterior, sphere.smooth), np.concatenate([coefficients, further])
+    projection, coefficients = projection.with_effect(posterior, sphere.smooth), np.concatenate([coefficients, further])
     # Fit the nine parameters to the poses that are no outliers.
     used = np.flatnonzero(posterior.outlier_probabilities < posterior.evidence.odds.reported)
     left = (rows.y - projection.columns @ coefficients)[used]
@@ -341,8 +341,8 @@ def _with_errors(
         reported[BIAS] += process_bias
         loss = sphere.loss(J @ reported)
         # Mean square error of |a| that the parameter covariance does not contain.
-        beside = loss - float(np.einsum("mi,ij,mj->", J, spread.whole, J, optimize=True)) / len(J)
-        unmodelled = _noticeable(np.array([beside, sphere.across]), sphere.there.error)
+        remaining = loss - float(np.einsum("mi,ij,mj->", J, spread.whole, J, optimize=True)) / len(J)
+        unmodelled = _noticeable(np.array([remaining, sphere.across]), sphere.there.error)
     return Average(
         sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, unmodelled, loss
     )

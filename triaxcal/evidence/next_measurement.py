@@ -408,7 +408,7 @@ def advice(posterior: Posterior, most: int = 3) -> Advice:
         if UNDECIDED_PROBABILITY < p < 1 - UNDECIDED_PROBABILITY
     }
     expected = {name: Expected(p, future.if_it_acts(name, p)) for name, p in names.items()}
-    return Advice((*_beside_poses(posterior), *future.actions), future.entropy, future.entropy_after, expected)
+    return Advice((*_other_actions(posterior), *future.actions), future.entropy, future.entropy_after, expected)
 
 
 def decided(posterior: Posterior) -> bool:
@@ -433,7 +433,7 @@ def _influential_poses(posterior: Posterior) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _beside_poses(posterior: Posterior) -> Iterator[Action]:
+def _other_actions(posterior: Posterior) -> Iterator[Action]:
     """Actions that are no poses: logging of a channel, and longer poses."""
     if not reaches(posterior.unmodelled_probability, posterior.evidence.odds.reported):
         return

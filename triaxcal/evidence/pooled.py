@@ -149,7 +149,7 @@ class Pooled:
             if other in names:
                 total += p
             elif p > np.exp(-NEGLIGIBLE_LOG_RATIO):
-                total += p * max(_product(_acts_beside(unit, name, other) for unit in self.units) for name in names)
+                total += p * max(_product(_acts_given(unit, name, other) for unit in self.units) for name in names)
         return total
 
     def certain(self, level: float) -> tuple[tuple[str, ...], ...]:
@@ -275,7 +275,7 @@ def _product(probabilities: Iterable[float]) -> float:
     return float(np.prod([*probabilities]))
 
 
-def _acts_beside(unit: Posterior, name: str, other: str) -> float:
+def _acts_given(unit: Posterior, name: str, other: str) -> float:
     """Probability of an effect in a unit, given another effect."""
     with_other = {names: p for names, p in unit.effect_set_probabilities.items() if other in names}
     total = sum(with_other.values())

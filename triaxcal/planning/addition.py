@@ -70,7 +70,7 @@ class Estimable(Effect):
         return np.concatenate([e.slope(s, covariates) for e in self.effects], axis=-1) @ self.seen
 
 
-def fitted_beside(
+def fit_with_estimable(
     poses: Sequence[Pose], effects: Sequence[Effect], *, signs: Sequence[float], reference: float
 ) -> Calibration:
     """The fit of the linear model together with the estimable combinations of
@@ -294,8 +294,8 @@ def missing_poses(
         labels = e.wanted or wanted_for(poses, signs)
         wanted = additions(existing, targets, [(label, where[label]) for label in labels])
         return MissingPoses(None, None, wanted, None, {}, tuple(absent), moves)
-    beside = fitted_beside(poses, there, signs=signs, reference=reference) if there else linear
-    existing, noise = _existing_of(beside, moves, channels_needed(targets.effects))
+    extended = fit_with_estimable(poses, there, signs=signs, reference=reference) if there else linear
+    existing, noise = _existing_of(extended, moves, channels_needed(targets.effects))
     first = most_wanted(existing.up, enough=ENOUGH, most=FULL, weights=existing.weights)
     now = targets.errors(
         targets.rows(existing.up, {n: v * existing.half.get(n, 1.0) for n, v in existing.held.items()}),

@@ -123,8 +123,8 @@ def _strongest(track: Track, deviation: Floats) -> tuple[float, int] | None:
     # Interpolate the peak by a parabola through the logarithms of three bins.
     below, at, above = np.log(np.maximum(power[peak - 1 : peak + 2, column], 1e-300))
     bend = below - 2 * at + above
-    beside = 0.5 * (below - above) / bend if bend < 0 else 0.0
-    return float(peak + np.clip(beside, -0.5, 0.5)) / (PADDED * n), column
+    offset = 0.5 * (below - above) / bend if bend < 0 else 0.0
+    return float(peak + np.clip(offset, -0.5, 0.5)) / (PADDED * n), column
 
 
 FALSE_CREEP = 0.01

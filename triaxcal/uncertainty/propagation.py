@@ -199,12 +199,12 @@ def uncertainty_of_readings(
     """(n,3) standard uncertainty of the specific force at outputs u (n,3), from the
     ``covariance`` (p,p) of the sensor's parameters and the unmodelled part; NaN where
     the covariance is not known."""
-    beside = unmodelled or NOTHING
+    unmodelled_part = unmodelled or NOTHING
     # Unmodelled part: σ_along² up² + σ_across² (1 − up²) by component.
     variance = np.zeros(u.shape)
-    if beside != NOTHING:
+    if unmodelled_part != NOTHING:
         square = sensor.up(u, covariates) ** 2
-        variance += beside.along**2 * square + beside.across**2 * (1 - square)
+        variance += unmodelled_part.along**2 * square + unmodelled_part.across**2 * (1 - square)
     # Variance of the parameters: sum over the principal axes of their covariance.
     for step in _steps(sensor, covariance, u, covariates):
         variance += step**2

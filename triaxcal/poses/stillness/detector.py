@@ -58,7 +58,7 @@ it. A lost pose costs its data; a pause that is taken for a pose puts the accele
 of the turn into it."""
 
 
-def without_turns(w: Windows, quiet: list[Ints], vibrating: list[Ints]) -> list[Ints]:
+def without_rotations(w: Windows, quiet: list[Ints], vibrating: list[Ints]) -> list[Ints]:
     """Still pieces in order of time, without those between quiet pieces that belong
     to an in-place rotation."""
     # Group the pieces by place; within a place, drop pieces between quiet ones.
@@ -199,7 +199,7 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     mean: no reading distinguishes the rotation from a bump. Where such rotations
     occur, ``turn_s`` is their shortest duration: a disturbance of that length
     separates spans, whatever the means, and a pause within it is no span
-    (`without_turns`).
+    (`without_rotations`).
     """
     # Constant windows of a digital output have the variance of half a step.
     raw, step = w.variance, resolution(w)
@@ -226,7 +226,7 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     if turn_s is None:
         kept, longest = sorted([*pieces, *vibrating], key=lambda p: int(p[0])), REJOIN_S
     else:
-        kept, longest = without_turns(w, pieces, vibrating), turn_s
+        kept, longest = without_rotations(w, pieces, vibrating), turn_s
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
     # Join pieces of one pose, then split poses that hide a move.
