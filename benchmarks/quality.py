@@ -20,14 +20,14 @@ import numpy as np
 
 from benchmarks.streams import COVARIATES, Condition, Stream, made
 from triaxcal.arrays import Floats, Ints
-from triaxcal.poses.quality import Finding, QualityDetector
+from triaxcal.poses.quality import QualityDetector, QualityFinding
 from triaxcal.poses.stillness.detector import StillnessDetector
 
 Fault = Callable[[Ints, Floats, Stream, np.random.Generator], tuple[Ints, Floats]]
 SCALE = 2.4  # volts per g
 
 
-def judged(time_ns: Ints, readings: Floats) -> list[Finding]:
+def judged(time_ns: Ints, readings: Floats) -> list[QualityFinding]:
     still, quality = StillnessDetector(), QualityDetector()
     still.feed(time_ns, readings)
     still.finish()

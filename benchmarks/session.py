@@ -24,7 +24,7 @@ from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.estimate.recordings import together
+from triaxcal.estimate.recordings import gather
 from triaxcal.pooled_units import PooledEffect, pooled_analysis
 from triaxcal.text.advice import chance
 from triaxcal.text.pooled_units import verdict
@@ -56,7 +56,7 @@ class Told:
 
 def told(asked: tuple[int, int]) -> Told:
     sensor, runs = asked
-    loop = diagnose(together([poses_of(run, sensor) for run in range(1, runs + 1)]))
+    loop = diagnose(gather([poses_of(run, sensor) for run in range(1, runs + 1)]))
     nan = float("nan")
     following = poses_of(runs + 1, sensor) if runs < 5 else None
     shape = {e.name: dict(e.shape) for e, _ in loop.after.sensor.effects if e.shape}
@@ -92,7 +92,7 @@ def _shape(shape: dict[str, tuple[float, str]]) -> str:
 
 
 def agree() -> Table:
-    found = pooled_analysis([diagnose(together([poses_of(run, s) for run in range(1, 6)])) for s in SENSORS])
+    found = pooled_analysis([diagnose(gather([poses_of(run, s) for run in range(1, 6)])) for s in SENSORS])
     rows = [
         [c.effect, chance(c.probability), chance(c.common), " ".join(f"{p:.2f}" for p in c.units), _shared(c)]
         for c in found.effects

@@ -15,7 +15,7 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
+from triaxcal.estimate.calibration import Calibration, Exclusion, ReferenceEpoch
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.corrected_calibration import corrected
@@ -30,7 +30,7 @@ from triaxcal.evidence.search import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
-from triaxcal.progress import Progress, Stage, untold
+from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
@@ -205,7 +205,7 @@ def diagnose(
     catalogue: Sequence[Effect] | None = None,
     at: Moment | float = Moment.END,
     odds: Odds | None = None,
-    progress: Progress = untold,
+    progress: Progress = unreported,
 ) -> Loop:
     """Find and correct the effects that still poses show beyond the linear
     model.
@@ -220,7 +220,7 @@ def diagnose(
     progress(Stage.FIT)
     linear = fit(poses, signs=signs, reference=reference)
     sound = [p for p in poses if not p.fault]
-    moment = HoldsAt.of(sound, at)
+    moment = ReferenceEpoch.of(sound, at)
     if moment is None:
         raise Refused("no pose without a fault")
     posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds, progress=progress)
@@ -272,7 +272,7 @@ class _Report:
     it would be if it acted."""
 
     posterior: Posterior
-    moment: HoldsAt
+    moment: ReferenceEpoch
     after: Calibration
     found: Findings
     conditional: dict[str, Calibration] = field(default_factory=dict)
@@ -281,23 +281,23 @@ class _Report:
     def finding(self, named: Named, refused: Refusal | None) -> Finding:
         probabilities = named.probabilities
         name, *others = probabilities
-        told = stated(self.found, probabilities)
+        calibrated = stated(self.found, probabilities)
         adopted = not others and refused is None
         coefficients, remedy = self._of(self.after, name) if adopted else self.if_it_acts(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
-            probability=told[name],
-            alternatives={other: told[other] for other in others},
+            probability=calibrated[name],
+            alternatives={other: calibrated[other] for other in others},
             coefficients=coefficients,
             remedy=remedy,
             together=named.together,
         )
 
     def candidate(self, name: str, probability: float) -> Candidate:
-        told = stated(self.found, {name: probability})[name]
+        calibrated = stated(self.found, {name: probability})[name]
         hangs = self.posterior.evidence.odds.hangs_on_one_pose(probability)
-        return Candidate(name, told, self.if_it_acts(name)[0], hangs)
+        return Candidate(name, calibrated, self.if_it_acts(name)[0], hangs)
 
     def if_it_acts(self, name: str) -> tuple[Coefficients, str]:
         made = average(self.posterior.conditional_on(name), self.moment)

@@ -23,7 +23,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, channel_of, covariate_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
-from triaxcal.estimate.calibration import HoldsAt, Origin, PoseResult, Residual
+from triaxcal.estimate.calibration import Origin, PoseResult, ReferenceEpoch, Residual
 from triaxcal.inputs.bias_update import Earlier
 from triaxcal.interchange import tables
 from triaxcal.interchange.calibration_document import Document, calibration_document
@@ -164,7 +164,7 @@ class Calibration:
         return {k: float(v) for k, v in known.items() if v is not None} if isinstance(known, Mapping) else {}
 
     @property
-    def holds_at(self) -> HoldsAt | None:
+    def holds_at(self) -> ReferenceEpoch | None:
         """The moment of its recording for which effects of time hold elsewhere."""
         return self._fitted.holds_at
 

@@ -24,5 +24,5 @@ class Progress(Protocol):
         ...
 
 
-def untold(stage: Stage, done: float | None = None) -> None:
+def unreported(stage: Stage, done: float | None = None) -> None:
     """Where nobody waits."""

@@ -14,7 +14,7 @@ from triaxcal.errors import TooShort
 from triaxcal.number_format import number_of
 from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose, StillSpan
-from triaxcal.poses.quality import Finding, disturbances
+from triaxcal.poses.quality import QualityFinding, disturbances
 from triaxcal.poses.stillness.windows import Windows
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
@@ -129,7 +129,7 @@ class Pipeline(DecodedStream):
         )
 
 
-def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = "") -> list[str]:
+def together(counted: Mapping[str, str], seen: Iterable[QualityFinding], unit: str = "") -> list[str]:
     """What was ``counted`` on the way here, by name, and what is ``seen`` in
     the samples, whose outputs are in ``unit``: one line for each kind of fault.
     What was counted as missing leaves the gaps that are seen, which are not

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.quality import Finding, QualityDetector
+from triaxcal.poses.quality import QualityDetector, QualityFinding
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import load_bundle, parse_bundle
@@ -132,7 +132,7 @@ def test_the_same_samples_are_judged_once_for_poses_and_data_quality(
     judged = []
     findings = QualityDetector.findings
 
-    def counted(self: QualityDetector, *arguments: Any, **options: Any) -> list[Finding]:
+    def counted(self: QualityDetector, *arguments: Any, **options: Any) -> list[QualityFinding]:
         judged.append(self.samples)
         return findings(self, *arguments, **options)
 

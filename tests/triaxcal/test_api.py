@@ -15,7 +15,7 @@ import triaxcal as tc
 from triaxcal.effects import effect_of
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.quality.finding import UNTRUSTED
+from triaxcal.poses.quality.finding import INVALIDATING
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcal.text import traces as text_of_traces
 
@@ -136,7 +136,7 @@ def test_what_a_stream_is_to_be_blamed_for_is_said(recorded: Recorded) -> None:
     u[1000:1300, 1] = u[1000, 1]
     found = tc.find_poses(recorded.t, u)
     assert [line.split(":")[0] for line in found.data_quality] == ["stuck_output"]
-    assert {p.fault for p in found} - {""} <= set(UNTRUSTED)
+    assert {p.fault for p in found} - {""} <= set(INVALIDATING)
 
 
 @pytest.mark.parametrize(

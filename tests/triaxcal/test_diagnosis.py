@@ -12,7 +12,7 @@ from tests.undeclared.examine import Case, still_poses
 from triaxcal.diagnosis import Loop, Recommendation, Verdict, diagnose
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import together
+from triaxcal.estimate.recordings import gather
 from triaxcal.evidence import Refusal, posterior_of
 from triaxcal.evidence.findings import Why
 from triaxcal.model.samples import Moment
@@ -162,6 +162,6 @@ def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(p
 
 @pytest.mark.slow
 def test_effects_of_several_runs_are_looked_for_once(poses_with: Poses) -> None:
-    poses = together([poses_with(1), poses_with(2)])
+    poses = gather([poses_with(1), poses_with(2)])
     terms = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS).evidence.terms
     assert [t.name for t in closed(poses).posterior.evidence.terms] == [t.name for t in terms]

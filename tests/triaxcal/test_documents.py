@@ -20,7 +20,7 @@ from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, is_derived
 from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Calibration as Fitted
-from triaxcal.estimate.calibration import HoldsAt, Residual
+from triaxcal.estimate.calibration import ReferenceEpoch, Residual
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
@@ -40,7 +40,7 @@ def calibration_with(sensor: Sensor, effect: Effect, rng: np.random.Generator) -
     fitted = Fitted(
         Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias, ((effect, q),)),
         np.diag(np.full(n, 1e-5) ** 2), 1.0, reference, Residual(0.0, 0.0, None, 0.0, None), (), 1.0, 1.0, 1.0, 100.0,
-        holds_at=HoldsAt(Moment.END, T_S, SINCE_MIDDLE_S),
+        holds_at=ReferenceEpoch(Moment.END, T_S, SINCE_MIDDLE_S),
     )  # fmt: skip
     return tc.Calibration(fitted, output_unit="V")
 

@@ -1,4 +1,4 @@
-"""The values that a fit gives: complete, with every reason not to trust them."""
+"""The result of a fit, with every reason to distrust it."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import channels_of, covariates, covariates_elsewhere, of_moment, of_readings, with_scale
 from triaxcal.poses.pose import Pose, PoseStart
 
-# Reasons not to trust a result, as values with their figures. `triaxcal.text` says
-# them in English.
+# Reasons to distrust a result, as values with their figures; `triaxcal.text` has
+# the sentences.
 
 
 @dataclass(frozen=True)
 class Caution:
-    """A reason not to trust a result in full."""
+    """A reason to distrust a part of a result."""
 
 
 @dataclass(frozen=True)
 class ExcludedPose:
-    """A pose that a fit excludes, when it began and how many standard errors
-    off it is."""
+    """A pose that a fit excludes, its beginning, and its studentized residual."""
 
     began: PoseStart
     studentized: float
@@ -45,7 +44,7 @@ class FaultyPosesExcluded(Caution):
 
 @dataclass(frozen=True)
 class UnknownHistoryExcluded(Caution):
-    """An effect goes with the pose before, which nobody knows."""
+    """An effect depends on the previous pose, which is not known."""
 
     poses: tuple[ExcludedPose, ...]
 
@@ -57,9 +56,9 @@ class PosesExcludedByCaller(Caution):
 
 @dataclass(frozen=True)
 class OutliersExcluded(Caution):
-    """``doubtful``: the other residuals leave it open whether all poses repeat
-    less well than their noise says, and the standard errors allow for that, by
-    ``excess`` (in the reference) where it is not 0."""
+    """``doubtful``: by the other residuals, the repeatability of all poses may be
+    worse than their noise; the standard errors allow for that by ``excess`` (in the
+    reference), where it is not 0."""
 
     poses: tuple[ExcludedPose, ...]
     doubtful: bool
@@ -68,16 +67,16 @@ class OutliersExcluded(Caution):
 
 @dataclass(frozen=True)
 class OutlierSetsTied(Caution):
-    """Any of these sets of poses may be outliers, or something else acts; none
-    is excluded."""
+    """Each of these sets of poses explains the data equally well as outliers; none is
+    excluded."""
 
     sets: tuple[tuple[PoseStart, ...], ...]
 
 
 @dataclass(frozen=True)
 class PoorSpread(Caution):
-    """Some combination of parameters is ``dilution`` times as uncertain as one
-    pose; poses ``wanted`` would mend it."""
+    """Some combination of parameters is ``dilution`` times as uncertain as one pose;
+    the poses ``wanted`` would reduce it."""
 
     dilution: float
     wanted: tuple[str, ...]
@@ -99,17 +98,17 @@ class HighLeverage(Caution):
 
 @dataclass(frozen=True)
 class ExcessVariance(Caution):
-    """Residuals show an ``excess`` standard deviation of |a|, in the reference,
-    that every pose has beside its noise; the standard errors allow for it."""
+    """Residuals show an ``excess`` standard deviation of |a| over the noise of the
+    poses, in the reference; the standard errors allow for it."""
 
     excess: float
 
 
 @dataclass(frozen=True)
 class BirgeRatio(Caution):
-    """Residuals are ``ratio`` times what noise explains, which raises the
-    standard errors. ``attitudes``: what noise and the error of the attitudes
-    explain."""
+    """Residuals are ``ratio`` times as large as expected from noise, which raises the
+    standard errors. ``attitudes``: the error of the attitudes is part of the
+    expectation."""
 
     ratio: float
     attitudes: bool = False
@@ -123,15 +122,14 @@ class ResidualsTooSmall(Caution):
 
 @dataclass(frozen=True)
 class Residual:
-    """How well the magnitude comes out, in units of the reference vector (g).
+    """Residuals of |a|, in units of the reference vector (g).
 
-    ``noise_floor_g`` is the rms of the standard errors of the pose means along
-    the measured vector, from the scatter inside the poses alone;
-    ``lack_of_fit_p`` the probability of residuals at least as large as these if the
-    model were complete and that noise were all. ``weighted_rms`` is the rms of
-    the residuals over those standard errors, and ``reduced_chi2`` their sum of
-    squares over the degrees of freedom that the model leaves; None where nobody
-    knows them.
+    ``noise_floor_g`` is the rms of the standard errors of the pose means along the
+    measured vector, from the scatter inside the poses alone; ``lack_of_fit_p`` is the
+    probability of residuals at least as large under a complete model and that noise.
+    ``weighted_rms`` is the rms of the residuals over those standard errors,
+    ``reduced_chi2`` their sum of squares over the degrees of freedom of the model;
+    None where not known.
     """
 
     rms_g: float
@@ -152,9 +150,8 @@ class Residual:
         lack_of_fit_p: float | None = None,
         left: float | None = None,
     ) -> Residual:
-        """Of the poses that a fit used: ``misses`` (n,) of |a| and the standard
-        errors (n,) of their noise; ``left`` are the degrees of freedom that the
-        model leaves."""
+        """The residual of the poses that a fit used: ``misses`` (n,) of |a|, standard
+        errors (n,) of their noise, and the residual degrees of freedom ``left``."""
         weighted = rms(misses / noise) if (noise > 0).all() else None
         chi2 = len(misses) * weighted**2 / left if weighted is not None and left is not None and left > 0 else None
         largest = float(np.max(np.abs(misses)))
@@ -162,14 +159,13 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class HoldsAt:
-    """The moment for which effects of time are evaluated in another recording,
-    whose clock is its own.
+class ReferenceEpoch:
+    """The reference epoch: the moment at which effects of time are evaluated in
+    another recording, whose clock is its own.
 
-    ``t_s`` in seconds from the first sample of the recording that was fitted,
-    of the last one where these are several; ``time_s`` the same as the
-    covariate `TIME` counts it, which of several recordings is from the middle
-    of each.
+    ``t_s`` counts in seconds from the first sample of the fitted recording (the last
+    of several); ``time_s`` is the same moment as the covariate `TIME`, which counts
+    from the middle of each of several recordings.
     """
 
     moment: Moment
@@ -177,9 +173,9 @@ class HoldsAt:
     time_s: float
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> HoldsAt | None:
-        """None where there are no poses. A number is a moment in seconds.
-        Raises InvalidData for one before the start."""
+    def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> ReferenceEpoch | None:
+        """The epoch of a set of poses; None where there are none. A number ``at`` is
+        a moment in seconds. Raises InvalidData for one before the start."""
         if not poses:
             return None
         last = max(p.run.index for p in poses)
@@ -196,7 +192,7 @@ class HoldsAt:
 
     @property
     def clocks(self) -> tuple[float, float]:
-        """As `triaxcal.poses.covariates.of_moment` has it."""
+        """(`t_s`, `time_s`), as `triaxcal.poses.covariates.of_moment` takes them."""
         return self.t_s, self.time_s
 
 
@@ -204,22 +200,20 @@ class Exclusion(StrEnum):
     """Why a fit does not use a pose."""
 
     FAULT = "fault"
-    """Its samples have one (`Pose.fault`)."""
+    """Its samples have a fault (`Pose.fault`)."""
     OUTLIER = "outlier"
     CALLER = "caller"
-    """The caller wanted it so."""
+    """Excluded by the caller."""
     UNKNOWN_HISTORY = "unknown_history"
-    """An effect goes with the pose before, and nobody knows that one: this one
-    need not be taken again."""
+    """An effect depends on the previous pose, which is not known. The pose itself
+    need not be repeated."""
 
 
 @dataclass(frozen=True)
 class PoseResult:
     """One pose under the fit. ``direction`` (3,) is up in the sensor's frame;
-    ``residual_g`` is |a| − reference; ``standard_error_g`` that of its noise,
-    ``total_standard_error_g`` with what residuals show beyond noise, where that
-    is known.
-    """
+    ``residual_g`` is |a| − reference; ``standard_error_g`` comes from its noise
+    alone, ``total_standard_error_g`` includes the excess variance, where known."""
 
     pose: Pose
     direction: Floats
@@ -230,11 +224,11 @@ class PoseResult:
     excluded: Exclusion | None = None
     total_standard_error_g: float | None = None
     outlier_probability: float | None = None
-    """None where nobody asked."""
+    """None where it was not computed."""
 
     @property
     def error_g(self) -> float:
-        """The standard error by all that is known."""
+        """The standard error with all known contributions."""
         return self.standard_error_g if self.total_standard_error_g is None else self.total_standard_error_g
 
     @property
@@ -253,8 +247,8 @@ def pose_results(
     total: Floats | None = None,
     excluded: Mapping[int, Exclusion] | None = None,
 ) -> tuple[PoseResult, ...]:
-    """Of arrays with a row for each pose; ``total`` are the standard errors
-    with what residuals show beyond noise, ``excluded`` has the reasons by row."""
+    """Pose results from arrays with a row for each pose; ``total`` are the standard
+    errors with excess variance, ``excluded`` the reasons by row."""
     reasons = excluded or {}
     return tuple(
         PoseResult(
@@ -272,16 +266,15 @@ def pose_results(
 
 
 def studentized(misses: Floats, error: Floats, leverage: Floats, least: float = 1e-6) -> Floats:
-    """(n,) residuals over their own standard errors; 0 where a pose leaves less
-    than the share ``least`` of its error to show as a residual."""
+    """(n,) residuals over their own standard errors, r / (s √(1 − h)); 0 where 1 − h
+    is too small: √(1 − h) of ``least`` or less."""
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     return np.where(free > least, misses / error / np.maximum(free, least), 0.0)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a calibration was made from, by name and digest; empty where nobody
-    said."""
+    """Sources of a calibration by name and digest; empty where not known."""
 
     calibration: str = ""
     sha256: str = ""
@@ -290,17 +283,16 @@ class Origin:
 
 @dataclass(frozen=True)
 class BiasUpdate:
-    """What a calibration of which the biases alone are new
-    (`triaxcal.inputs.bias_update`) has of the ``earlier`` one.
+    """Data of the ``earlier`` calibration of which only the biases were renewed
+    (`triaxcal.inputs.bias_update`).
 
-    ``covariances`` (9+p,9+p) of the parameters by their source add up to that
-    of the calibration. ``before`` is how well the magnitude came out in the
-    poses under the earlier one, ``shift`` (3,) what the biases moved by,
-    ``shift_error`` (3,) the standard deviations by which they were expected to.
-    ``scatter_g`` is a standard deviation of |a| that every pose of the unit has
-    beside its noise, known by ``scatter_dof`` degrees of freedom;
-    ``start_to_start`` that from one recording to another, ``measured`` or
-    assumed. All in the unit of the reference.
+    ``covariances`` (9+p,9+p) of the parameters by source add up to that of the
+    calibration. ``before`` is the residual of the poses under the earlier
+    calibration, ``shift`` (3,) the change of the biases, ``shift_error`` (3,) its
+    expected standard deviation. ``scatter_g`` is the standard deviation of |a| from
+    pose to pose in excess of the noise, with ``scatter_dof`` degrees of freedom;
+    ``start_to_start`` that from one recording to another, ``measured`` or assumed.
+    All in the unit of the reference.
     """
 
     earlier: Origin
@@ -317,9 +309,9 @@ class BiasUpdate:
 
 @dataclass(frozen=True)
 class Unmodelled:
-    """Standard deviations, in units of the reference, of what acts on a reading
-    and no parameter describes: of |a| (``along`` the measured vector), and of
-    each component across it, which |a| does not show. rms over the sphere."""
+    """Standard deviations, in units of the reference, of unmodelled contributions to
+    a reading: to |a| (``along`` the measured vector), and to each component across
+    it, which |a| does not show. Rms over the sphere."""
 
     along: float
     across: float
@@ -327,27 +319,26 @@ class Unmodelled:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A fitted sensor. ``covariance`` is of `parameters`, in that order.
+    """A fitted sensor. ``covariance`` is that of `parameters`, in this order.
 
-    ``reference`` is the magnitude of the reference vector;
-    ``channel_reference`` the values from which the effects' covariates are
-    counted. Residuals that exceed the noise raise the standard errors: by a
-    factor on all errors, ``birge_ratio``, at least 1 unless no pose knows its
-    noise (then the residuals alone set it); or by ``excess_g``, a standard
-    deviation of |a| that every pose has beside its noise
+    ``reference`` is the magnitude of the reference vector; ``channel_reference`` are
+    the zero points of the effects' covariates. Residuals in excess of the noise raise
+    the standard errors: by ``birge_ratio``, a factor on all errors, at least 1 unless
+    no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
+    standard deviation of |a| added to the noise of every pose
     (`triaxcal.estimate.fit_assessment`). ``dof`` are the effective degrees of freedom
-    behind the standard errors. ``shape_errors`` are standard errors of the
-    effects' shapes, by "effect.name". ``slopes``: how |a| goes inside the poses
-    was fitted along with their means. ``weights`` is the probability of each
-    effect where the coefficients are means over all that may act. Then
-    ``prior_sd`` (p,) are the standard deviations of the coefficients before the
-    poses were seen, and ``thermal`` (9+p,9+p) is the part of the covariance
-    that thermal effects make which the model has not. ``unmodelled`` is beside
-    the covariance: None where nobody asked, or nothing acts. ``holds_at`` None:
-    effects of time count as long after the start, as in documents of 0.1.
-    ``linear_only`` is the linear model fitted by itself, where there are
-    effects and somebody asked for it. ``update`` is what it has of an earlier
-    calibration of which it keeps all but the biases.
+    of the standard errors. ``shape_errors`` are standard errors of the effects'
+    shapes, by "effect.name". ``slopes``: slopes inside the poses were fitted together
+    with the means.
+
+    ``weights`` are the probabilities of the effects in a model average. Then
+    ``prior_sd`` (p,) are the prior standard deviations of the coefficients, and
+    ``thermal`` (9+p,9+p) is the part of the covariance due to thermal effects that
+    the model lacks. ``unmodelled`` is independent of the covariance; None where it
+    was not estimated or nothing acts. ``holds_at`` None: effects of time count from
+    the start, as in documents of 0.1. ``linear_only`` is the linear model fitted by
+    itself, where it was requested and there are effects. ``update`` describes a bias
+    update of an earlier calibration.
     """
 
     sensor: Sensor
@@ -369,13 +360,13 @@ class Calibration:
     prior_sd: Floats | None = field(default=None, repr=False)
     thermal: Floats | None = field(default=None, repr=False)
     unmodelled: Unmodelled | None = None
-    holds_at: HoldsAt | None = None
+    holds_at: ReferenceEpoch | None = None
     linear_only: Calibration | None = field(default=None, repr=False)
     update: BiasUpdate | None = field(default=None, repr=False)
 
     @property
     def moment(self) -> tuple[float, float] | None:
-        """`holds_at` as `triaxcal.poses.covariates.of_moment` has it."""
+        """`holds_at` as `triaxcal.poses.covariates.of_moment` takes it."""
         return None if self.holds_at is None else self.holds_at.clocks
 
     @property
@@ -389,23 +380,24 @@ class Calibration:
 
     @property
     def values(self) -> Floats:
-        """Of `parameters`."""
+        """(9+p,) values of `parameters`."""
         s = self.sensor
         return np.concatenate([s.scale_factor, s.misalignment, s.bias, *(c for _, c in s.effects)])
 
     @property
     def standard_errors(self) -> Floats:
-        """Of `parameters`."""
+        """(9+p,) standard errors of `parameters`."""
         return np.sqrt(np.diag(self.covariance))
 
     def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:
-        """name → (value, standard error, unit) of the coefficients of the
-        effect of that name, and of its shape.
+        """name → (value, standard error, unit) of the coefficients of an effect, and
+        of its shape.
 
-        The standard error is None where the poses do not tell it. That of the
-        moment of a step holds that it may have been anywhere between two poses.
-        Raises KeyError for an effect that is not in the model.
+        The standard error is None where the poses do not determine it. That of the
+        moment of a step covers all moments between two poses. Raises KeyError for an
+        effect that is not in the model.
         """
+        # Linear coefficients with the errors of the fit, then shapes with their own.
         errors = dict(zip(self.parameters, self.standard_errors, strict=True))
         effect, q = {e.name: (e, q) for e, q in self.sensor.effects}[name]
         out: dict[str, tuple[float, float | None, str]] = {
@@ -417,12 +409,9 @@ class Calibration:
         return out
 
     def coverage_factor(self, level: float = 0.95) -> float:
-        """By what a standard error is multiplied for an interval that holds the
-        truth with probability ``level``.
-
-        Student's t for `dof`, as JCGM 100, G.3, has it. Raises InvalidData for
-        a level outside 0 to 1.
-        """
+        """Factor on a standard error for an interval of confidence ``level``:
+        Student's t for `dof` (JCGM 100, G.3). Raises InvalidData for a level outside
+        0 to 1."""
         if not 0 < level < 1:
             raise InvalidData(f"a level of confidence lies between 0 and 1, not at {level}")
         return float(t_ppf((1 + level) / 2, self.dof))
@@ -434,19 +423,19 @@ class Calibration:
         return self.values - half, self.values + half
 
     def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
-        """a (n,3) of single readings (n,3) in output units, with the
-        ``channels`` (n,) that are known of them. Raises Refused where the model
-        has no inverse there."""
+        """a (n,3) in g, in the sensor's frame, of single readings (n,3) in output
+        units with their ``channels`` (n,). Raises Refused where the model has no
+        inverse."""
         covariates, _ = self.covariates_of_readings(len(readings), channels)
         return self.sensor.specific_force(readings, covariates)
 
     def covariates_of_readings(
         self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Of n single readings with the ``channels`` (n,) that are known of
-        them: and the covariates that are needed and not known, which count as
-        at their reference. Effects of time at the times ``t_s`` (n,) of the
-        recording that was fitted, at `holds_at` where that is None."""
+        """Covariates of n single readings with the ``channels`` (n,), and the names
+        of needed covariates that are missing and count as at their reference. Effects
+        of time are evaluated at ``t_s`` (n,) of the fitted recording, or at
+        `holds_at` where that is None."""
         if t_s is None:
             clocks: Mapping[str, Floats | float] = of_moment(self.channel_reference, self.moment)
         else:
@@ -455,8 +444,8 @@ class Calibration:
         return of_readings(channels, self.channel_reference, n, clocks)
 
     def covariates_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
-        """Of poses of the recording that it was fitted to. Effects of time of an
-        earlier recording count as at `holds_at` in those of an `update`."""
+        """Covariates of poses of the fitted recording. After a bias `update`, effects
+        of time of the earlier recording are evaluated at `holds_at`."""
         if self.update is not None:
             return covariates_elsewhere(
                 poses, self.channel_reference, self.sensor.scale_factor, self.sensor.bias, self.moment

@@ -1,5 +1,5 @@
-"""What a fit says of itself: the covariance of its parameters, the residuals of
-its poses, and how far both may be trusted."""
+"""The assessment of a fit: covariance of the parameters, residuals of the poses, and
+warnings."""
 
 from __future__ import annotations
 
@@ -42,39 +42,37 @@ from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, lack_of_fit_p, raised
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import probability
 
-# Standard errors of what the fit holds fixed: the shapes of effects
-# (`Effect.shape`), which the search has chosen.
+# Standard errors of the shapes of effects (`Effect.shape`), which the search has
+# chosen and the fit holds fixed.
 
 UNLIKELY = 16.0
-"""Chi-square over its minimum beyond which a value, and what is next to it,
-needs no closer look."""
+"""Chi-square over its minimum beyond which a value and its neighbours need no
+refinement."""
 STRAIGHT = 1.0
-"""The likelihood is looked at so closely that chi-square changes by no more
-from one value to the next."""
+"""Largest change of chi-square from one value of the profile to the next."""
 HALVED_MOST = 8
-"""Halvings of an interval, to 1/256: a likelihood that is steeper still is an
-edge."""
+"""Halvings of an interval, to 1/256: a steeper likelihood is an edge."""
 PARTS = 20
-"""Parts of an interval in the sum that stands for an integral: chi-square
-changes by about `STRAIGHT` over it, so that the weight changes little over a
-part."""
+"""Parts of an interval in the sum for an integral: chi-square changes by about
+`STRAIGHT` over it, so the weight changes little over a part."""
 NOTHING_LIKE = 1e300
-"""In place of infinity, between which and the next nothing could be
-interpolated."""
+"""In place of infinity, which cannot be interpolated."""
 
 
 def shape_errors(
     problem: Problem, state: State, columns: Floats, thousandths: Floats, birge_ratio: float
 ) -> dict[str, float]:
-    """By "effect.name"; none of a shape that moves nothing at all.
+    """Standard errors by "effect.name"; no entry for a shape without influence.
 
     ``columns`` (n,m) are the derivatives of the residuals by the shapes,
-    ``thousandths`` (m,) the standard errors by these, in thousandths of the
-    shapes' values, raised by the ``birge_ratio`` already.
+    ``thousandths`` (m,) the standard errors from these, in thousandths of the shapes'
+    values, with the ``birge_ratio`` applied.
     """
     out = {}
     named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
     for (i, name, value), column, thousandth in zip(named, columns.T, thousandths, strict=True):
+        # Effects with edges: integrate the profile likelihood. Others: curvature at the
+        # minimum.
         error = _by_likelihood(problem, state, i, name, birge_ratio) if has_edges(state.effects[i]) else None
         if error is None and np.any(column):
             error = 1e-3 * abs(value) * float(thousandth)
@@ -84,21 +82,22 @@ def shape_errors(
 
 
 def has_edges(effect: Effect) -> bool:
-    """Whether it changes at the edges of poses, as a step does: the likelihood
-    of its shape has kinks there, and is flat between two poses, so that its
-    curvature tells nothing."""
+    """Whether the effect changes at the edges of poses, as a step does. The
+    likelihood of its shape has kinks there and is flat between two poses, so its
+    curvature is no measure of the error."""
     return DURATION in effect.needs
 
 
 def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[float], edges: Floats) -> float | None:
-    """The rms distance from a shape's ``value`` to what it may be, each
-    weighted by its likelihood, from the lowest to the highest of those
-    ``tried``; ``edges`` are those of the poses. None where only one was tried.
+    """Rms deviation from a shape's ``value`` under the profile likelihood exp(−χ²/2),
+    over the range of the values ``tried``; ``edges`` are those of the poses. None
+    where only one value was tried.
 
-    Of a step between two poses that is the rectangular distribution over the
-    time between them (JCGM 100, 4.3.7), with shoulders where it may have been
-    inside a pose, and other gaps where the directions of the poses hide it.
+    For a step between two poses this is the rectangular distribution over the time
+    between them (JCGM 100, 4.3.7), with shoulders inside the poses, and with other
+    gaps where the directions of the poses hide the step.
     """
+    # Evaluate the profile at the values tried, then at the likely edges, then refine.
     profile = _Profile(chi2_at)
     profile.look_at(np.unique([value, *tried]))
     if len(profile.x) < 2:
@@ -109,7 +108,7 @@ def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[floa
 
 
 def edges_of(problem: Problem) -> Floats:
-    """When poses begin and end, in seconds since the start."""
+    """Times (2n,) at which poses begin and end, in seconds since the start."""
     middle, half = problem.covariates[SINCE_START], problem.covariates[DURATION] / 2
     return np.concatenate([middle - half, middle + half])
 
@@ -138,17 +137,18 @@ class _Profile:
 
     @property
     def _likely(self) -> Bools:
-        """(m−1,) the intervals of which one end is."""
+        """(m−1,) the intervals with a likely value at one end."""
         return np.asarray(np.minimum(self.chi2[:-1], self.chi2[1:]) < self.chi2.min() + UNLIKELY)
 
     def where_likely(self, more: Floats) -> Floats:
-        """Of further values those in intervals that are likely."""
+        """Those of further values that lie in likely intervals."""
         more = np.setdiff1d(more, self.x)
         more = more[(self.x[0] < more) & (more < self.x[-1])]
         return np.asarray(more[self._likely[np.searchsorted(self.x, more) - 1]])
 
     def look_closer(self) -> None:
-        """Halves the likely intervals along which chi-square changes."""
+        """Halve the likely intervals over which chi-square changes by more than
+        `STRAIGHT`."""
         for _ in range(HALVED_MOST):
             coarse = self._likely & (np.abs(np.diff(self.chi2)) > STRAIGHT)
             if not coarse.any():
@@ -156,17 +156,19 @@ class _Profile:
             self.look_at((self.x[:-1] + self.x[1:])[coarse] / 2)
 
     def spread_about(self, value: float) -> float:
-        """The rms distance from a value, each weighted by its likelihood, of
-        which the logarithm is straight between two."""
+        """Rms deviation from a value, weighted by the likelihood; its logarithm is
+        interpolated linearly."""
+        # Midpoint rule: PARTS points in each interval.
         wide = np.diff(self.x)
         at = (self.x[:-1, None] + wide[:, None] * (np.arange(PARTS) + 0.5) / PARTS).ravel()
+        # Weight exp(−(χ² − χ²min)/2) times the width of the interval.
         weight = np.repeat(wide, PARTS) * np.exp((self.chi2.min() - np.interp(at, self.x, self.chi2)) / 2)
         return float(np.sqrt(np.sum(weight * (at - value) ** 2) / np.sum(weight)))
 
 
 def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
-    """Chi-square with another value of a shape, everything else fitted again,
-    in linear reckoning."""
+    """Chi-square with another value of a shape and all else refitted, in linear
+    approximation."""
     other = reshaped(state.effects[i], name, value)
     with np.errstate(over="ignore", invalid="ignore"):
         return residual_chi2(
@@ -174,38 +176,41 @@ def _left(problem: Problem, state: State, i: int, name: str, value: float) -> fl
         )
 
 
-# How well a fit predicts the poses that it did not see.
+# Cross-validation: prediction of poses that the fit did not see.
 
 STRAIGHT_STEP = 1e-4
-"""Steps of the scaled parameters up to which the fit is straight, to about this
-share of the step."""
+"""Steps of the scaled parameters up to which the fit is linear, to about this share
+of the step."""
 
 
 def cross_validated(problem: Problem, state: State) -> float | None:
-    """rms of each pose's |a| − reference under a fit to all the others; None
-    where a pose alone carries a parameter.
+    """Leave-one-out rms of |a| − reference; None where a pose alone determines a
+    parameter.
 
-    ``state`` is at the minimum. What leaving a pose out moves is exact for a
-    linear problem; where that is so far that the curvature could show, the rest
-    is fitted again from there.
+    ``state`` is at the minimum. Deletion is exact for a linear problem, r_(i) = (1 −
+    H_ii)⁻¹ r_i; where the parameters move so far that curvature may matter, the rest
+    is fitted again.
     """
     r, J, s = linearise_all(problem, state)
     n = len(problem.u)
     if len(r) <= len(state.theta):
         return None
+    # Pseudo-inverse of the weighted Jacobian, with columns of length one.
     norms = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
     weighted = J / s[:, None] / norms
     gain = np.linalg.pinv(weighted, rcond=1e-14)
-    # By pose (n,k): its mean, and what else it tells, which is excluded with
-    # it.
+    # Rows of a pose (n,k): its mean and its slope, which are deleted together.
     of_pose = np.arange(len(r)).reshape(-1, n).T
+    # Diagonal blocks of the hat matrix: the leverage of each pose.
     hat = np.einsum("nkp,pnl->nkl", weighted[of_pose], gain[:, of_pose])
     free = np.eye(of_pose.shape[1]) - hat
     if np.linalg.eigvalsh(free).min() < 1e-6:
         return None
+    # Deleted residuals, and the change of theta by the deletion of each pose.
     misses = np.linalg.solve(free, (r / s)[of_pose][..., None])[..., 0]
     moved = np.einsum("pnk,nk->np", gain[:, of_pose] / norms[:, None, None], misses)
     misses = misses[:, 0] * s[:n]
+    # Fit again without those poses that move the parameters far.
     for i in np.flatnonzero(np.abs(moved).max(axis=1) > STRAIGHT_STEP):
         rest: Ints = np.delete(np.arange(n), i)
         without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=2)
@@ -213,39 +218,36 @@ def cross_validated(problem: Problem, state: State) -> float | None:
     return rms(misses)
 
 
-# What residuals show beyond the noise inside the poses, and what it makes of the
-# errors.
+# Excess variance of the residuals over the noise inside the poses.
 
 NO_CHANCE = 1e-4
-"""Lack-of-fit p below which an excess variance is added, which changes the
-weights. Above it, a Birge ratio multiplies all errors. It is small because
-other weights cost a hundredfold in variance where poses differ much in noise
-and no excess was there."""
+"""Lack-of-fit p below which an excess variance is added, which changes the weights.
+Above it, a Birge ratio multiplies all errors. The limit is small because other
+weights cost a hundredfold in variance where poses differ much in noise and there is
+no excess."""
 EXACT = 1e-10
-"""To which share the excess is sought."""
+"""Relative tolerance of the root for the excess."""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard
-    deviation of |a|, in units of the reference vector, that all poses have
-    beside their noise."""
+    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard deviation
+    of |a|, in units of the reference vector, added in quadrature to the noise of
+    every pose."""
 
     birge_ratio: float = 1.0
     excess_g: float = 0.0
 
     @classmethod
     def estimated(cls, linearised: Linearised, n: int, residual_dof: int, pure_dof: float) -> Excess:
-        """That with which the sum of squares that a fit leaves is its
-        ``residual_dof``, in linear reckoning from residuals, derivatives and
-        errors near its minimum, of which the first ``n`` are the means of the
-        poses. ``pure_dof`` are the degrees of freedom of the noise inside the
-        poses.
+        """The ratio or the excess with which chi-square equals ``residual_dof``.
 
-        The excess is that of Mandel and Paule (1970, Anal. Chem. 42:1194), here
-        for a fit of several parameters; the factor that of Birge (1932, Phys.
-        Rev. 40:207), at least 1 unless no pose knows its noise. Raises Refused
-        where the fit ran away.
+        ``linearised`` are residuals, derivatives and errors near the minimum; the
+        first ``n`` rows are the means of the poses. ``pure_dof`` are the degrees of
+        freedom of the noise inside the poses. The excess is that of Mandel and Paule
+        (1970, Anal. Chem. 42:1194), here for a fit of several parameters; the ratio
+        that of Birge (1932, Phys. Rev. 40:207), at least 1 unless no pose knows its
+        noise. Raises NotStill where the fit diverged.
         """
         r, J, s = linearised
 
@@ -253,21 +255,23 @@ class Excess:
             error = s * np.tile(_widened(s[:n], excess), len(s) // n)
             return residual_chi2((r, J, error)) / residual_dof
 
+        # Lack-of-fit test against the noise inside the poses.
         whole = ratio(0.0) if residual_dof > 0 else 1.0
         if not np.isfinite(whole):
             raise NotStill("the fit ran away")
         p = probability(lack_of_fit_p(whole * residual_dof, residual_dof, pure_dof))
         if p is None or p >= NO_CHANCE:
             return cls(float(np.sqrt(whole if pure_dof < 1 else max(whole, 1.0))))
+        # Bracket the excess, then solve χ²(excess) = residual_dof, by Brent's method.
         high = float(np.linalg.norm(r[:n])) / np.sqrt(residual_dof) + float(np.max(s[:n]))
         while ratio(high) > 1:
             high *= 2
         return cls(excess_g=float(scipy.optimize.brentq(lambda e: ratio(e) - 1, 0.0, high, xtol=EXACT * high)))
 
     def added_to(self, problem: Problem, state: State) -> Problem:
-        """The problem with the excess; ``state`` is near its minimum. What else
-        a pose tells is widened as its mean is: what acts between poses may act
-        inside them as well."""
+        """The problem with the excess; ``state`` is near its minimum. Slopes are
+        widened by the same factor as the means: a disturbance between poses may act
+        inside them too."""
         if not self.excess_g:
             return problem
         slopes = problem.slopes and problem.slopes.widened(_widened(linearise(problem, state)[2], self.excess_g))
@@ -275,33 +279,38 @@ class Excess:
 
 
 def _widened(error: Floats, excess: float) -> Floats:
-    """(n,) by what an excess widens errors (n,)."""
+    """(n,) factors by which an excess enlarges errors (n,): √(1 +
+    (excess/error)²)."""
     return np.asarray(np.hypot(1.0, excess / error))
 
 
 DILUTION_WARNING = 10.0
-"""A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold,
-but are large."""
+"""A tenth of `DILUTION_LIMIT`, at which a fit is refused: the errors are still valid,
+but large."""
 SPREAD_WARNING = 15.0
-"""Dilution times the root of the number of poses: about 5 where they are all
-over the sphere, 25 over half of it."""
+"""Dilution times the root of the number of poses: about 5 for poses all over the
+sphere, 25 for half of it."""
 LEFT_LEAST = 3
-"""Degrees of freedom below which a residual proves little: its standard
-deviation is known to about 40 % by three."""
+"""Degrees of freedom below which a residual proves little: with three, its standard
+deviation is known to about 40 %."""
 LEVERAGE_WARNING = 0.95
-"""Such a pose shows no more than a twentieth of its own error as a residual."""
+"""A pose of higher leverage shows less than a twentieth of its own error as a
+residual."""
 
 
 def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Problem | None) -> Calibration:
-    """Of a fit at its minimum; ``judged`` as `_ResidualChi2` has it. Raises
-    NotStill where the fit ran away."""
+    """The calibration from a fit at its minimum; ``judged`` as in `_ResidualChi2`.
+    Raises NotStill where the fit diverged."""
+    # Chi-square of the residuals, and the excess over the noise.
     linearised, n = _linearised(problem, state), len(poses)
     found = _ResidualChi2.of(linearised, problem, state, judged, within_pose_dof(poses))
     noise, birge_ratio = linearised[2][:n], found.excess.birge_ratio
+    # An excess changes the weights: solve again.
     if found.excess.excess_g:
         problem = found.excess.added_to(problem, state)
         state = solve(problem, state, state.effects)
         linearised = linearise_all(problem, state)
+    # Leverage, directions and their dilution.
     every_r, J, every_s = linearised
     r, s, p = every_r[:n], every_s[:n], J.shape[1]
     weighted = J / every_s[:, None]
@@ -309,6 +318,7 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     sensor = state.sensor(problem)
     up = sensor.up(problem.u, problem.covariates)
     spread = _dilution(problem, up)
+    # Covariance of parameters and shapes together, times the squared Birge ratio.
     shapes = by_shape(problem, state)
     covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / every_s[:, None]) * birge_ratio**2
     calibration = Calibration(
@@ -337,10 +347,9 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
 
 @dataclass(frozen=True)
 class _ResidualChi2:
-    """``chi2``, in units of the noise inside the poses, that a fit leaves in
-    ``dof`` degrees of freedom; ``with_doubtful`` both with excluded poses whose
-    residuals tell how well all come back, and the ``excess`` over the noise
-    that these show."""
+    """``chi2`` of a fit in units of the noise inside the poses, with ``dof`` degrees
+    of freedom; ``with_doubtful``: both with the doubtful outliers included;
+    ``excess`` from the latter."""
 
     chi2: float
     dof: int
@@ -351,18 +360,20 @@ class _ResidualChi2:
     def of(
         cls, linearised: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
     ) -> _ResidualChi2:
-        """``judged`` are the means of all those poses where they are more;
-        ``pure`` the degrees of freedom of the noise inside them."""
+        """``judged`` are the means of the poses with the doubtful outliers, or None;
+        ``pure`` the degrees of freedom of the noise inside the poses."""
         n = len(problem.u)
-        # What the shape of an effect was chosen by is spent, though no column
-        # of the Jacobian stands for it.
+        # Shapes of effects count as fitted parameters, though they have no column in
+        # the Jacobian.
         spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
+        # Means alone decide where they have degrees of freedom; else means and slopes.
         by_means = problem.slopes is None or n > spent
         r, J, s = linearised
         own = (r[:n], J[:n], s[:n]) if by_means else linearised
         chi2, dof = residual_chi2(own), len(own[0]) - spent
         if judged is None or not by_means:
             return cls(chi2, dof, (chi2, dof), Excess.estimated(own, n, dof, pure))
+        # The same with the doubtful outliers.
         others = linearise(judged, State.of(judged, state.sensor(problem)))
         with_doubtful = residual_chi2(others), dof + len(judged.u) - n
         return cls(chi2, dof, with_doubtful, Excess.estimated(others, len(judged.u), with_doubtful[1], pure))
@@ -383,7 +394,7 @@ def _leverage(weighted: Floats) -> Floats:
 
 
 def _condition(weighted: Floats) -> float:
-    """Of the weighted Jacobian with columns of length one."""
+    """Condition number of the weighted Jacobian with columns of length one."""
     return float(np.linalg.cond(weighted / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)))
 
 
@@ -397,13 +408,15 @@ def _dilution(problem: Problem, up: Floats) -> float:
 
 
 def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
-    """Of scale factor, misalignment, bias and the effects' coefficients, from
-    the weighted Jacobian; further columns are of what was estimated beside
+    """Covariance of scale factor, misalignment, bias and coefficients from the
+    weighted Jacobian; further columns belong to quantities estimated together with
     them."""
+    # (JᵀJ)⁻¹ with columns of length one.
     norms = np.linalg.norm(weighted, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
     inverse = np.linalg.pinv((weighted / norms).T @ (weighted / norms), rcond=1e-14)
     theta = inverse / np.outer(norms, norms)
+    # Transform from theta to the reported parameters: G C Gᵀ.
     G = np.eye(len(theta))
     G[: len(state.theta), : len(state.theta)] = parameters_by_theta(problem, state)
     return np.asarray(G @ theta @ G.T)
@@ -425,7 +438,8 @@ def _cautions(c: Calibration) -> Iterator[Caution]:
 
 
 def too_small(residual: Residual) -> Iterator[ResidualsTooSmall]:
-    """Of residuals that noise and creep hardly ever leave so small."""
+    """A caution where residuals are smaller than noise and creep would leave with
+    reasonable probability."""
     p = probability(residual.lack_of_fit_p)
     if p is not None and p > 1 - SIGNIFICANT / 5:
         yield ResidualsTooSmall()

@@ -1,5 +1,5 @@
-"""The weighted maximum-likelihood fit of a triad's model to still poses: which
-poses it uses, and whether the slopes inside them count."""
+"""The weighted maximum-likelihood fit of a triad's model to still poses: selection of
+the poses, and use of the slopes inside them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from triaxcal.estimate.calibration import (
     ExcludedPose,
     Exclusion,
     FaultyPosesExcluded,
-    HoldsAt,
     OutlierSetsTied,
     OutliersExcluded,
     PoseResult,
     PosesExcludedByCaller,
+    ReferenceEpoch,
     UnknownHistoryExcluded,
 )
 from triaxcal.estimate.creep import slopes_p, with_slopes
@@ -40,35 +40,35 @@ from triaxcal.poses.pose import Pose
 ALARM = 0.005
 """Probability that a clean set loses a pose, or a pair."""
 LEFT_LEAST = 3
-"""So many degrees of freedom must be left, or there is nothing to judge a pose
+"""Degrees of freedom that must remain: with fewer, nothing is left to test a pose
 by."""
 TIED = 2.2
-"""Sums of squares that differ by less than this for each pose of a set (a
-likelihood ratio of 3) do not tell one set from another."""
+"""Sets whose chi-squares differ by less than this per pose (a likelihood ratio of 3)
+are tied."""
 LEAST = 6.0
-"""Poses that are off by less than so many standard errors stay: that may be a
-stand that does not come back."""
+"""Poses that are off by fewer standard errors stay in: the cause may be a stand of
+poor repeatability."""
 EXCESS = 0.003
-"""Where what is left of the residuals has less than this probability, it is
-more than noise."""
+"""Probability of the remaining residuals below which they show excess variance over
+the noise."""
 DOUBT = 0.01
 """Probability above which a pose does not stand out from the others' residuals."""
 PAIRED_MOST = 300
-"""So many poses are tried in pairs; where there are more, hardly any hides
-another."""
+"""Number of poses that are tried in pairs. In larger sets an outlier hardly ever
+masks another."""
 FREE_LEAST = 1e-6
-"""Poses whose share of (1 − H) is below this alone carry a parameter, and
-cannot be judged."""
+"""Poses with a smaller diagonal element of (1 − H) determine a parameter alone and
+cannot be tested."""
 
 
 @dataclass(frozen=True)
 class OutlierSet:
-    """``rows`` are outliers. Besides, one of ``tied`` is: sets of rows that
-    explain it as well as each other.
+    """``rows`` are outliers. In addition, one set of ``tied`` is: these sets of rows
+    explain the data equally well.
 
-    Where only the noise inside the poses says so, because the rows do not stand
-    out from the other residuals, it is ``doubtful``: it may be that the poses
-    come back less well than that.
+    The rows are ``doubtful`` where only the noise inside the poses excludes them and
+    they do not stand out from the other residuals: the repeatability of all poses may
+    be worse than their noise.
     """
 
     rows: tuple[int, ...] = ()
@@ -78,12 +78,12 @@ class OutlierSet:
 
 @dataclass(frozen=True)
 class _DeletionDiagnostics:
-    """Residuals ``residuals`` (n,) after the fit in units of the poses'
-    standard errors, ``q`` (n,p) whose product with its transpose is the hat
-    matrix H.
+    """Single- and pair-deletion statistics of a linear fit (Cook and Weisberg 1982).
 
-    ``dof`` (n,) behind each standard error, ``pure_dof`` behind them together;
-    zero where the noise is not known.
+    ``residuals`` (n,) are in units of the poses' standard errors; ``q`` (n,p) has
+    orthonormal columns with q qᵀ = H, the hat matrix. ``dof`` (n,) are the degrees of
+    freedom of each standard error, ``pure_dof`` those of all together; zero where the
+    noise is not known.
     """
 
     residuals: Floats
@@ -97,51 +97,59 @@ class _DeletionDiagnostics:
         return float(self.residuals @ self.residuals)
 
     def singles(self) -> tuple[Ints, Floats]:
-        """Rows (n,1), and what each takes out of the sum of squares."""
+        """Rows (n,1), and the reduction in chi-square (n,) by deletion of each."""
+        # Deleting row i lowers chi-square by e_i² / (1 − h_ii).
         share = 1 - (self.q**2).sum(axis=1)
         taken = np.where(share > FREE_LEAST, self.residuals**2 / np.maximum(share, FREE_LEAST), 0.0)
         return np.arange(len(self.residuals))[:, None], taken
 
     def pairs(self) -> tuple[Ints, Floats]:
-        """Likewise for pairs of rows, (m,2), among those that take most alone."""
+        """Pairs of rows (m,2) among those with the largest single reduction, and the
+        reduction in chi-square (m,) by deletion of each pair."""
         rows = np.sort(np.argsort(-self.singles()[1], kind="stable")[:PAIRED_MOST])
         free = self.free(rows)
+        # Deleting rows i, j lowers chi-square by eᵀ (1 − H)ᵢⱼ⁻¹ e, with the 2×2 block
+        # of 1 − H.
         first, second = np.triu_indices(len(rows), 1)
         a, b, c = free[first, first], free[second, second], free[first, second]
         i, j = rows[first], rows[second]
         r, s = self.residuals[i], self.residuals[j]
+        # Pairs with a singular block determine a parameter together: not testable.
         determinant = a * b - c**2
         sound = determinant > FREE_LEAST * np.maximum(a, b)
         taken = (b * r**2 - 2 * c * r * s + a * s**2) / np.where(sound, determinant, 1.0)
         return np.stack([i, j], axis=1), np.where(sound, taken, 0.0)
 
     def deleted_residuals(self, rows: Ints) -> Floats:
-        """By how much the poses in ``rows`` are off, from the fit to the
-        others."""
+        """Residuals of the poses in ``rows`` from the fit to the others: (1 − H)⁻¹
+        e."""
         return np.linalg.solve(self.free(rows), self.residuals[rows])
 
     def free(self, rows: Ints) -> Floats:
-        """(1 − H) among ``rows``."""
+        """The block of (1 − H) for ``rows``."""
         return np.eye(len(rows)) - self.q[rows] @ self.q[rows].T
 
     def excess(self, after: float, left: int) -> float:
-        """What is left, ``after`` in ``residual_dof`` degrees of freedom, over
-        the noise; 1 where that explains it."""
+        """Reduced chi-square of the rest (``after`` in ``left`` degrees of freedom)
+        where it exceeds the noise significantly, else 1."""
         known = self.pure_dof >= 1
         return 1.0 if known and f_sf(after / left, left, self.pure_dof) >= EXCESS else after / left
 
     def by_rest(self, taken: float, size: int) -> float:
-        """Probability that ``size`` rows take so much, against what is left
-        without them alone."""
+        """F-test probability that ``size`` rows reduce chi-square by ``taken``,
+        against the residuals of the rest alone."""
         after, left = max(self.chi2 - taken, 1e-300), self.residual_dof - size
         return float(f_sf(taken / size / (after / left), size, left))
 
     def p(self, taken: float, rows: Ints, before: float, left: int) -> float:
-        """Of ``rows`` that take so much of ``before``: against the noise, or
-        what is left where that is more."""
+        """Probability that ``rows`` reduce the chi-square ``before`` by ``taken``:
+        the larger of the F-tests against the noise and against the rest, where the
+        rest exceeds the noise."""
         size = len(rows)
+        # Excess of the rest over the noise, after the deletion.
         after, left_after = max(before - taken, 0.0), left - size
         excess = self.excess(after, left_after)
+        # F-test against the noise inside the poses, then against the rest.
         dof = float(self.dof[rows].min())
         p = float(f_sf(taken / size, size, dof)) if dof >= 1 else 0.0
         if excess != 1.0:
@@ -150,17 +158,20 @@ class _DeletionDiagnostics:
 
 
 def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSet:
-    """Rows that are outliers, at most two; often none.
+    """At most two rows that are outliers; often none.
 
-    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of
-    each pose's standard error; ``dof`` (n,) degrees of freedom behind each of
-    these, ``pure_dof`` behind them together.
+    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each
+    pose's standard error; ``dof`` (n,) degrees of freedom of these, ``pure_dof`` of
+    all together.
     """
+    # Residuals after projection off the column space of J.
     n, parameters = J.shape
     left = n - parameters
     q, _ = np.linalg.qr(J)
     judge = _DeletionDiagnostics(r - q @ (q.T @ r), q, left, dof, pure_dof)
     best, best_p = OutlierSet(), ALARM
+    # Test the best single row, then the best pair, each with a Bonferroni factor for
+    # the number of candidates.
     for size, (rows, taken) in enumerate((judge.singles(), judge.pairs()), 1):
         if left - size < LEFT_LEAST:
             break
@@ -172,9 +183,9 @@ def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSe
 
 
 def not_as_predicted(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) -> tuple[int, ...]:
-    """Those of a few ``rows`` of which something that they alone have is not
-    known, and that show it: each takes more out of the sum of squares than a
-    coefficient of its own costs. Arguments are those of `outlier_set`."""
+    """Those of ``rows`` with an unknown covariate of their own whose residual shows
+    it: deletion reduces chi-square by more than the penalty ln n of one coefficient
+    (BIC). Arguments as in `outlier_set`."""
     n, parameters = J.shape
     q, _ = np.linalg.qr(J)
     judge = _DeletionDiagnostics(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
@@ -185,25 +196,30 @@ def not_as_predicted(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int])
 
 
 def _unless_tied(judge: _DeletionDiagnostics, rows: Ints, taken: Floats) -> OutlierSet:
+    # Sets within the tie limit of the best one.
     size = rows.shape[1]
     most = float(taken.max())
     excess = judge.excess(max(judge.chi2 - most, 0.0), judge.residual_dof - size)
     near = rows[taken >= most - TIED * size * excess]
     sets = tuple(tuple(int(i) for i in row) for row in near)
+    # Rows that all tied sets share are certain; the remainders stay as alternatives.
     certain = tuple(sorted(set.intersection(*map(set, sets))))
     tied = tuple(tuple(i for i in each if i not in certain) for each in sets) if len(sets) > 1 else ()
+    # Doubtful where the rest alone, without the known noise, would not exclude them.
     doubtful = judge.by_rest(most, size) * len(rows) > DOUBT
     return OutlierSet(certain, tied, bool(certain) and doubtful)
 
 
 def _each_stands_alone(judge: _DeletionDiagnostics, rows: Ints, both: float) -> bool:
-    """Whether each is off by enough, and either of a pair would be suspect if
-    the other had never been there."""
+    """Whether each row is off by enough standard errors, and either row of a pair
+    would be an outlier without the other."""
+    # Smallest deleted residual, in units of noise and excess.
     excess = judge.excess(max(judge.chi2 - both, 0.0), judge.residual_dof - len(rows))
     if np.min(np.abs(judge.deleted_residuals(rows))) < LEAST * np.sqrt(excess):
         return False
     if len(rows) == 1:
         return True
+    # Each of a pair against the data without the other.
     _, singles = judge.singles()
     for one, other in (rows, rows[::-1]):
         alone = float(singles[other])
@@ -212,35 +228,37 @@ def _each_stands_alone(judge: _DeletionDiagnostics, rows: Ints, both: float) -> 
     return True
 
 
-# The poses that a fit excludes: which these are, and what the calibration of the
-# others says of them.
+# Excluded poses: their selection, and their entries in the calibration.
 
 OUTLIER_ROUNDS = 4
-"""The search is repeated without the outliers found, since large ones bend the
-fit beyond linear reckoning; it ends sooner once the set stays the same. The
-last set stands."""
+"""The search is repeated without the outliers found, because large ones bend the fit
+beyond the linear approximation; it ends once the set stays the same. The last set
+stands."""
 
 
 def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> OutlierSet:
-    """Indices of outliers, from the fit to all. Sought anew without those
-    found, until the same are found again: a pose off by a thousand times its
-    noise bends the fit so far that linear reckoning is off.
+    """Indices of outliers, from the fit to all poses.
 
-    What the others show beside their noise, all are taken to have: by the noise
-    alone the quietest would look like outliers.
+    The search is repeated on the fit without the outliers found until the set stays
+    the same: a pose off by a thousand times its noise invalidates the linear
+    approximation. The excess variance of the remaining poses counts for all: by the
+    noise alone the quietest poses would look like outliers.
     """
     own, together = pose_dof(poses), within_pose_dof(poses)
     dof, pure, judged, found = own, together, problem, OutlierSet()
     for _ in range(OUTLIER_ROUNDS):
+        # Test all poses under the present fit and noise.
         r, J, s = linearise(judged, state)
         again = outlier_set(r / s, J / s[:, None], dof, pure)
         if again.rows == found.rows:
             return again
         found = again
+        # Fit the rest, and estimate its excess variance.
         rest: Ints = np.delete(np.arange(len(poses)), found.rows)
         others, left = problem.only(rest), len(rest) - len(state.theta)
         state = solve(others, state, state.effects)
         judged = replace(problem, excess=Excess.estimated(linearise(others, state), len(rest), left, together).excess_g)
+        # Degrees of freedom of noise plus excess (Welch–Satterthwaite).
         share = judged.excess**2 / linearise(judged, state)[2] ** 2
         dof, pure = combined_dof(share, left, own), float(combined_dof(share.mean(), left, together))
     return found
@@ -249,10 +267,11 @@ def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Out
 def with_unknown_history(
     problem: Problem, state: State, poses: Sequence[Pose], excluded: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Poses, besides those ``excluded``, that are not as if the unit had rested
-    there before; what was is not known."""
+    """Further poses to exclude: poses of unknown history whose residuals contradict
+    the assumption that the unit rested there before."""
     if not (unknown := set(of_unknown_history(poses, state.effects)) - set(excluded)):
         return ()
+    # Fit the rest and test the poses of unknown history alone.
     rest: Ints = np.delete(np.arange(len(poses)), excluded)
     problem = problem.only(rest)
     r, J, s = linearise(problem, solve(problem, state, state.effects))
@@ -262,8 +281,8 @@ def with_unknown_history(
 
 
 def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
-    """A calibration from the sound ones of ``poses`` with the faulty ones among
-    its results, and a caution."""
+    """A calibration from the sound poses, completed by the faulty ones among its
+    results and a caution."""
     faulty = [i for i, p in enumerate(poses) if p.fault]
     if not faulty:
         return calibration
@@ -275,12 +294,13 @@ def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
 def _among(
     calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, Exclusion]
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
-    """The results of a calibration with those of further, excluded poses among
-    them, by rows of all; and these."""
+    """The pose results of a calibration, with those of further excluded poses
+    inserted by row; and the inserted ones."""
     u = np.array([p.mean for p in poses])
     covariates = calibration.covariates_of(poses)
     length, by_u = calibration.sensor.magnitude(u, covariates)
     a = calibration.sensor.specific_force(u, covariates)
+    # An excluded pose has leverage 0; its residual is divided by noise and excess.
     results, added = list(calibration.poses), []
     for i, reason in sorted(reasons.items()):
         noise = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
@@ -294,9 +314,9 @@ def _among(
 def with_excluded(
     calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: OutlierSet, why: Exclusion
 ) -> Calibration:
-    """The calibration with the excluded poses among its results, in order of
-    time, and cautions that name them: those that an effect knows no history of,
-    and else as ``why`` says."""
+    """The calibration with the excluded poses among its results, in order of time,
+    and cautions that name them. The reason is the unknown history where an effect
+    needs it, else ``why``."""
     unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
     results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
 
@@ -314,8 +334,8 @@ def with_excluded(
 
 
 def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: OutlierSet) -> Calibration:
-    """The calibration with a caution of sets of poses one of which may hold the
-    outliers, where the data do not tell which."""
+    """The calibration with a caution of tied sets, one of which holds the
+    outliers."""
     if not verdict.tied:
         return calibration
     tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.tied))
@@ -323,8 +343,7 @@ def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: Out
 
 
 CONTRADICTED = 0.01
-"""p of the slopes within the poses below which the coefficients are left to the
-means."""
+"""p of the slopes within the poses below which the slopes are not used."""
 
 
 def fit(
@@ -338,20 +357,21 @@ def fit(
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded``
-    are indices of poses to exclude, and ``why``; where it is None, outliers are
-    found and excluded (`triaxcal.estimate.pose_fit`), and where an effect goes
-    with the pose before, a first pose in which the unit had not rested before.
-    Poses with a fault are excluded in any case. Raises Refused where the poses
-    cannot carry the parameters, InvalidData where a channel that an effect
-    needs is not there.
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``reference`` is the
+    magnitude of the reference vector. ``excluded`` are indices of poses to exclude
+    for the reason ``why``. Where it is None, outliers are found and excluded, and so
+    is a first pose of unknown history where an effect depends on the previous pose.
+    Poses with a fault are always excluded. Raises Refused where the poses cannot
+    carry the parameters, InvalidData where a channel that an effect needs is missing.
     """
+    # Faulty poses never enter: fit the sound ones and add the faulty to the results.
     sound = [i for i, p in enumerate(poses) if not p.fault]
     if len(sound) < len(poses):
         among = None if excluded is None else [k for k, i in enumerate(sound) if i in excluded]
         kept = [poses[i] for i in sound]
         sound_fit = fit(kept, signs=signs, reference=reference, effects=effects, excluded=among, why=why)
-        return replace(with_faulty(sound_fit, poses), holds_at=HoldsAt.of(poses))
+        return replace(with_faulty(sound_fit, poses), holds_at=ReferenceEpoch.of(poses))
+    # Closed form with all poses, then the selection of poses.
     whole, begin = started_problem(poses, signs=signs, reference=reference, effects=effects)
     _require_channels(whole, effects)
     if excluded is None:
@@ -360,18 +380,19 @@ def fit(
     else:
         chosen = _Excluded(OutlierSet(tuple(sorted(excluded))))
     kept, problem, by_means = list(poses), whole, chosen.by_means
+    # Start anew with the remaining poses.
     if chosen.rows:
         kept = [p for i, p in enumerate(poses) if i not in chosen.rows]
         problem, begin = started_problem(kept, signs=signs, reference=reference, effects=effects)
         by_means = None
-    # What may be no worse than the others shows by how much all come back less
-    # well than their noise.
+    # Doubtful outliers stay in when the pose-to-pose scatter is estimated.
     known = np.setdiff1d(np.arange(len(poses)), chosen.of_unknown_history)
     judged = whole.only(known) if chosen.outliers.doubtful else None
+    # Solve, and state covariance, residuals and cautions.
     calibration = concluded(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if chosen.rows:
         calibration = with_excluded(calibration, poses, chosen.rows, chosen.outliers, why)
-    return replace(with_tied_sets(calibration, poses, chosen.outliers), holds_at=HoldsAt.of(poses))
+    return replace(with_tied_sets(calibration, poses, chosen.outliers), holds_at=ReferenceEpoch.of(poses))
 
 
 def _require_channels(problem: Problem, effects: Sequence[Effect]) -> None:
@@ -383,8 +404,8 @@ def _require_channels(problem: Problem, effects: Sequence[Effect]) -> None:
 @dataclass(frozen=True)
 class _Excluded:
     """The poses that a fit excludes, by row: ``outliers``, and those
-    ``of_unknown_history``. ``by_means`` is the fit to the means of all poses,
-    where there was one."""
+    ``of_unknown_history``. ``by_means`` is the fit to the means of all poses, where
+    there was one."""
 
     outliers: OutlierSet
     of_unknown_history: tuple[int, ...] = ()
@@ -409,13 +430,13 @@ def _found_by_residuals(problem: Problem, begin: State, poses: Sequence[Pose], e
 def _solved(
     problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect], by_means: State | None
 ) -> tuple[Problem, State]:
-    """What was fitted, and the fit: to the means (``by_means``, where that is
-    known already), and to the slopes inside the poses as far as these agree
-    with them.
+    """The problem that was fitted and its solution: pose means (``by_means``, where
+    already known), together with the slopes inside the poses where both agree.
 
-    Slopes that do not agree go with something else, or the effect acts later
-    than its channel says.
+    Slopes that disagree follow something else, or the effect acts later than its
+    channel.
     """
+    # Fit means and slopes together, where slopes are known.
     both = with_slopes(problem, poses, effects)
     contradicted = False
     if both is not None:
@@ -423,12 +444,14 @@ def _solved(
             state = solve(both, begin, tuple(effects))
         except (Refused, EffectFault):  # an effect may be known at the means alone
             state = None
+        # Test of the slopes' residuals against the fit.
         contradicted = state is not None and slopes_p(both, state, within_pose_dof(poses)) < CONTRADICTED
         if state is not None and not contradicted:
             return both, state
+    # Else the means alone.
     state = by_means or solve(problem, begin, tuple(effects))
-    # Means that leave nothing agree with any model: what speaks against it is
-    # all that there is to judge it by.
+    # Means without degrees of freedom agree with any model; contradicting slopes
+    # are then the only evidence against it.
     if len(state.theta) > len(poses) - contradicted:
         raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
     return problem, state

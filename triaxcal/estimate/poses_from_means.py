@@ -1,5 +1,5 @@
-"""Poses of which only the means are known, as others publish them and old test
-benches keep them."""
+"""Poses of which only the means are known, as in publications and from old test
+benches."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from triaxcal.model.sensor import LINEAR
 from triaxcal.poses.pose import Pose
 
 NOISE_FIRST = 1e-4
-"""Of the outputs' size: a noise to begin with, far below what turning changes."""
+"""Initial noise as a share of the outputs' size, far below the change by
+orientation."""
 ROUNDS, SETTLED = 10, 0.05
-"""The noise is estimated until it changes by less than so much; two or three
-rounds do."""
+"""The noise is estimated until it changes by a smaller share; two or three rounds
+suffice."""
 
 
 def poses_of_means(
@@ -27,14 +28,14 @@ def poses_of_means(
     standard_errors: Floats | None = None,
     channels: Mapping[str, Floats] | None = None,
 ) -> list[Pose]:
-    """One pose a row: ``u`` (n,3) means in output units, ``t_s`` (n,) s when it
-    was held, one a second where that is not known, ``standard_errors`` (n,3) of
-    the means, output units.
+    """One pose a row: ``u`` (n,3) means in output units, ``t_s`` (n,) times in
+    seconds (one pose a second where not given), ``standard_errors`` (n,3) of the
+    means in output units.
 
-    Without standard errors the noise is the residual of the linear model, alike
-    on all axes, with the degrees of freedom that the fit leaves: then no lack
-    of fit can show, and an effect only against all the others. Raises Refused
-    where nothing is left to tell it by, InvalidData.
+    Without standard errors the noise is the residual of the linear model, equal on
+    all axes, with the degrees of freedom of the fit. Then no lack of fit can show,
+    and an effect shows only against the other poses. Raises Refused where no degree
+    of freedom is left, InvalidData for bad standard errors.
     """
     n = len(u)
     if standard_errors is not None and not (np.isfinite(standard_errors).all() and (standard_errors > 0).all()):
@@ -64,6 +65,8 @@ def _with_noise_of_residuals(poses: Sequence[Pose]) -> list[Pose]:
             f"{len(poses)} pose means without standard errors: nine parameters leave nothing to tell the noise by; "
             f"{LINEAR + 1} or more are needed"
         )
+    # Alternate: fit with the present noise, then estimate it from the residuals as σ² =
+    # Σ r² k² / (n − 9).
     before = 0.0
     for _ in range(ROUNDS):
         found = fit(poses)

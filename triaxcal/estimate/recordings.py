@@ -1,9 +1,10 @@
-"""Several recordings of one unit as one set of poses: one linear model, and
-effects of the clocks run by run.
+"""Several recordings of one unit as one set of poses: one linear model, and effects
+of the clocks run by run.
 
-Every recording has its own clock, and the unit was switched on anew before it:
-a drift, a warm-up or a step may be in one run alone, alike in all, or in each
-its own; and the bias may come back a little different at every start."""
+Every recording has its own clock, and the unit was switched on anew before it. A
+drift, a warm-up or a step may act in one run alone, in all alike, or in each
+differently; the bias may differ from one start to the next.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +26,10 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose, Run
 
 POSES_A_COEFFICIENT = 4.0
-"""Forms with more coefficients of a run than one for so many of its poses are
-not tried."""
+"""A form has at most one coefficient of a run for so many of its poses."""
 
 
-def together(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
+def gather(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
     """The poses of several recordings of one unit, in that order, each with its
     `Run`. One recording's as they are.
 
@@ -48,8 +48,8 @@ def together(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
 
 
 def by_run(catalogue: Sequence[Effect], poses: Sequence[Pose]) -> tuple[Effect, ...]:
-    """The effects to look for: of several runs, those of the clocks run by run,
-    and what differs between runs; else as they are."""
+    """The effects of the search. For several runs: effects of the clocks run by run,
+    and effects between runs; for one run the ``catalogue``."""
     runs = poses[0].run.of if poses else 1
     if runs == 1:
         return tuple(catalogue)
@@ -58,10 +58,9 @@ def by_run(catalogue: Sequence[Effect], poses: Sequence[Pose]) -> tuple[Effect, 
 
 @dataclass(frozen=True)
 class ByRun(Wrapped):
-    """An effect of the clocks, of which the search tries: alike in all
-    ``runs``; in one alone; in each, and in all but one, by coefficients of
-    their own. One that lasts begins in one run.
-    """
+    """An effect of the clocks. The search tries: the same in all ``runs``; in one
+    alone; with coefficients of its own in each, and in all but one. An effect that
+    lasts begins in one run."""
 
     runs: int
 
@@ -71,8 +70,10 @@ class ByRun(Wrapped):
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         out: list[Effect] = []
+        # The same in all runs, on the clock of the longest run.
         if not self.whole.lasting:
             out += self.whole.variants(longest(covariates, range(self.runs)))
+        # With coefficients of their own, as far as the runs have poses enough.
         for runs in self._sets():
             fewest = min(int(np.sum(covariates[RUN] == run)) for run in runs)
             most = len(runs) * fewest / POSES_A_COEFFICIENT
@@ -91,8 +92,8 @@ class ByRun(Wrapped):
 
 @dataclass(frozen=True)
 class RunResidual:
-    """How well the magnitude comes out in the poses of one run, before and
-    after, rms in units of the reference."""
+    """Residuals of |a| in the poses of one run, before and after: rms in units of the
+    reference."""
 
     poses: int
     before_rms_g: float
@@ -101,8 +102,8 @@ class RunResidual:
 
 
 def residuals_by_run(before: Calibration, after: Calibration) -> list[RunResidual]:
-    """Of the poses that the fits used, by run. ``before`` and ``after`` are of
-    the same poses."""
+    """Residuals by run, of the poses that both fits used. ``before`` and ``after``
+    are of the same poses."""
     used: Mapping[int, list[int]] = {i: [] for i in range(after.poses[0].pose.run.of)}
     for i, (old, new) in enumerate(zip(before.poses, after.poses, strict=True)):
         if old.used and new.used:
@@ -122,20 +123,18 @@ def residuals_by_run(before: Calibration, after: Calibration) -> list[RunResidua
     ]
 
 
-# Whether recordings are of one unit: by the shape of its triad, which age and
-# temperature hardly change.
+# Unit identity: the shape of the triad, which age and temperature hardly change.
 
 MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3
-"""Standard deviations, of each, by which one mass-market unit differs from
-itself in another recording: scale factors by what 20 K make of them where
-nothing corrects that (`triaxcal.uncertainty`, 3e-4/K)."""
+"""Standard deviations of a misalignment [rad] and of a scale factor (relative)
+between two recordings of one mass-market unit: the latter is the effect of 20 K
+without correction (`triaxcal.uncertainty`, 3e-4/K)."""
 POSES_LEAST = 12
-"""Fewer tell hardly more than nine parameters: what the model lacks goes into
-these."""
+"""With fewer poses, unmodelled effects go into the nine parameters."""
 BY_CHANCE = 1e-4
-"""The probability that one unit is asked about."""
+"""Probability of a false alarm for one unit."""
 RATIOS = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
-"""(2,3) by the logarithms of the scale factors: those of two ratios."""
+"""(2,3) differences of the logarithms of the scale factors: two ratios."""
 RATIOS.flags.writeable = False
 
 
@@ -151,6 +150,7 @@ class Shape:
     @classmethod
     def of(cls, scale_factor: Floats, misalignment: Floats, covariance: Floats, dof: float) -> Shape:
         """``covariance`` (6,6) of both, in that order."""
+        # Linear propagation: d ln k = dk / k, and the angles unchanged.
         to_shape = np.zeros((5, 6))
         to_shape[:2, :3] = RATIOS / scale_factor
         to_shape[2:, 3:] = np.eye(3)
@@ -163,8 +163,8 @@ def shape_of(c: Calibration) -> Shape:
 
 
 def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: float) -> Shape | None:
-    """By a fit of the linear model to these poses alone; None where they do not
-    carry one, or are few."""
+    """The shape from a linear fit to these poses alone; None where they do not carry
+    one, or are few."""
     try:
         found = fit(poses, signs=signs, reference=reference)
     except (Refused, InvalidData):
@@ -172,12 +172,12 @@ def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: flo
     return shape_of(found) if sum(p.used for p in found.poses) >= POSES_LEAST else None
 
 
-def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
-    """The same by what the outputs would be without the effects that ``held``
-    has."""
+def shape_without_effects(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
+    """The shape from these poses after subtraction of the effects of ``held``."""
     sensor = held.sensor
     if sensor.effects:
         try:
+            # Outputs without the effects: u = K (s + b).
             at = covariates_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias, held.moment)
             s = sensor.along_axes(np.array([p.mean for p in poses]), at)
         except Refused:
@@ -187,8 +187,8 @@ def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
 
 
 def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
-    """Of a `triaxcal.calibration/1` document; None where it does not say how
-    well its shape is known."""
+    """The shape in a `triaxcal.calibration/1` document; None where it has no usable
+    values and standard errors."""
     try:
         k, m = (np.array(calibration[name], dtype=float) for name in ("scale_factor", "misalignment"))
         errors = [calibration["standard_error"][name] for name in ("scale_factor", "misalignment")]
@@ -202,29 +202,32 @@ def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
 
 @dataclass(frozen=True)
 class ShapesDiffer:
-    """Two shapes are hardly of one unit: they differ by up to ``angle_rad`` in
-    the misalignments and by up to ``ratio`` in the logarithm of the ratios of
-    scale factors."""
+    """Two shapes that probably belong to two units: they differ by up to
+    ``angle_rad`` in the misalignments and by up to ``ratio`` in the logarithm of the
+    ratios of scale factors."""
 
     angle_rad: float
     ratio: float
 
 
 def difference_of_shapes(one: Shape | None, another: Shape | None) -> ShapesDiffer | None:
-    """None where two recordings, or a calibration and a recording, may well be
-    of one unit, or where one of the shapes is not known."""
+    """None where both may belong to one unit, or where one of the shapes is not
+    known."""
     if one is None or another is None:
         return None
+    # Covariance of the difference: both fits, and the spread of one unit.
     apart = one.values - another.values
     of_one_unit = np.zeros((5, 5))
     of_one_unit[:2, :2] = SCALE_FACTOR**2 * RATIOS @ RATIOS.T
     of_one_unit[2:, 2:] = MISALIGNMENT_RAD**2 * np.eye(3)
     weight = one.covariance + another.covariance + of_one_unit
+    # Mahalanobis distance of the shapes.
     squares = float(apart @ np.linalg.solve(weight, apart))
     # Welch–Satterthwaite: the spread of one unit is known, the errors of the
     # fits are estimated.
     shares = [(np.trace(np.linalg.solve(weight, s.covariance)) / len(apart), s.dof) for s in (one, another)]
     dof = 1 / max(sum(share**2 / dof for share, dof in shares), 1e-9)
+    # F-test of the mean square with five degrees of freedom.
     if not f_sf(squares / len(apart), len(apart), dof) < BY_CHANCE:
         return None
     ratio, angle = (float(np.max(np.abs(v))) for v in ([*apart[:2], apart[:2].sum()], apart[2:]))

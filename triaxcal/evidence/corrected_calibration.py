@@ -9,7 +9,14 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.effects.empirical import Empirical
-from triaxcal.estimate.calibration import BirgeRatio, Calibration, ExcessVariance, HoldsAt, Residual, ResidualsTooSmall
+from triaxcal.estimate.calibration import (
+    BirgeRatio,
+    Calibration,
+    ExcessVariance,
+    ReferenceEpoch,
+    Residual,
+    ResidualsTooSmall,
+)
 from triaxcal.estimate.fit_assessment import too_small
 from triaxcal.estimate.likelihood import State, linearise
 from triaxcal.evidence.linearised_data import LinearisedData
@@ -20,7 +27,7 @@ from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
 from triaxcal.uncertainty.propagation import extrapolated, gain_given_prior
 
 
-def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> tuple[Calibration, Refusal | None]:
+def corrected(before: Calibration, posterior: Posterior, at: ReferenceEpoch) -> tuple[Calibration, Refusal | None]:
     """The calibration with the likely effects at their mean coefficients, and
     why no name is corrected in it. ``before`` is the linear calibration of all
     poses that were given: where no effect is to be corrected (`least_loss`), it

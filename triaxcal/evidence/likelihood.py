@@ -19,14 +19,13 @@ from triaxcal.evidence.row_covariance import LowRank, RowPrecision
 from triaxcal.evidence.terms import Term, TermColumns, WeightedColumns
 from triaxcal.evidence.unmodelled_kernels import OWN, UnmodelledCovariance, kinds_of, local_kinds_of
 
-# What may be assumed of an unmodelled part, and the data as they weigh under one
-# such assumption.
+# The assumptions on the unmodelled part, and the data weighted under each.
 
 
 @dataclass(frozen=True, eq=False)
 class UnmodelledPart:
-    """The assumption on what no term describes: nothing, or one ``kind`` of
-    size ``tau`` standard errors."""
+    """An assumption on what no term describes: nothing, or a random function of one
+    ``kind`` with a size of ``tau`` standard errors."""
 
     kind: UnmodelledCovariance | None
     tau: float
@@ -34,11 +33,14 @@ class UnmodelledPart:
 
 
 def parts_of(rows: LinearisedData, odds: Odds, suspects: Sequence[int] | None = None) -> list[UnmodelledPart]:
-    """The first is that there is none. What goes through all poses is no larger
-    over the sphere than an effect may be: poses that show little of it, as half
-    a sphere does, leave it open whether it is there. Parts that a few poses
-    alone show are among them where some of these are ``suspects``: may be
-    outliers."""
+    """The parts of the search; the first is "none".
+
+    A part that acts in all poses is no larger over the sphere than an effect may be:
+    poses that show little of it, as half a sphere does, do not determine whether it
+    is there. Local parts, which only a few poses show, are included where some of
+    these poses are ``suspects``, possible outliers.
+    """
+    # A log-uniform grid of sizes; the prior is shared equally between kinds and sizes.
     kinds = kinds_of(rows)
     sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
     share = float(np.log(odds.unmodelled_probability / len(kinds) / len(sizes)))
@@ -58,10 +60,10 @@ def parts_of(rows: LinearisedData, odds: Odds, suspects: Sequence[int] | None = 
 
 @dataclass(frozen=True, eq=False)
 class WeightedData:
-    """The data under one part, less what the nine parameters take: the
-    ``precision`` of the rows beyond these, the terms' ``columns`` by the
-    weights of that, and the products (D,k) of their base ``along`` its axes,
-    the misfits ``left`` (N,)."""
+    """The data under one part, after projection off the nine parameters:
+    ``precision`` of the projected rows, the terms' columns ``weighted`` by its
+    diagonal, the products (D,k) of their base ``along`` its axes, and the misfits
+    ``left`` (N,)."""
 
     precision: RowPrecision
     weighted: WeightedColumns
@@ -83,12 +85,12 @@ class WeightedData:
 
     @cached_property
     def chi2(self) -> float:
-        """The sum of squares with no term."""
+        """Chi-square with no term: yᵀ P y."""
         return float(self.left @ self._weighted_left)
 
     @cached_property
     def score(self) -> Floats:
-        """Of every scaled coefficient (C,), with no term."""
+        """Score (C,) of every scaled coefficient at zero: Xᵀ P y."""
         return np.asarray(self.columns.against(self._weighted_left)[self.columns.place] * self.columns.factor)
 
     @cached_property
@@ -97,34 +99,38 @@ class WeightedData:
         return np.asarray(whole - self.columns.block_products(self.along, precision.axes, precision.taken))
 
     def _along(self, places: Ints) -> Floats:
-        """(q,k) of these scaled coefficients' columns, unscaled."""
+        """(q,k) products of these coefficients' columns, unscaled, with the axes."""
         return self.columns.along_of(self.columns.place[places], self.along, self.precision.axes)
 
     def information(self, places: Ints) -> Floats:
-        """(t,q,q) of terms with coefficients at ``places`` (t,q), one by one."""
+        """(t,q,q) information matrices of single terms with coefficients at
+        ``places`` (t,q)."""
         return self.columns.of_blocks(self._block_products, places)
 
     def normal_equations(self, places: Ints) -> tuple[Floats, Floats]:
         """Information (q,q) and score (q,) of these scaled coefficients."""
+        # P = diag(w) − A t Aᵀ, so Xᵀ P X = Xᵀ diag(w) X − (Xᵀ A) t (Xᵀ A)ᵀ.
         along = self._along(places) * self.columns.factor[places][:, None]
         return self.weighted.among(places) - (along * self.precision.taken) @ along.T, self.score[places]
 
     def crossed(self, places: Ints) -> Floats:
-        """(q,C) the information that these scaled coefficients have in common
-        with all."""
+        """(q,C) cross information of these scaled coefficients with all."""
         place, factor = self.columns.place, self.columns.factor
         taken = self._along(places) * self.precision.taken
         whole = self.weighted.with_all(place[places])
         whole = whole - np.concatenate([taken @ self.along.T, taken @ self.precision.axes.T], axis=1)
         return np.asarray(factor[places][:, None] * whole[:, place] * factor)
 
-    def beside(self, places: Ints, scale: Floats) -> ConditionalData:
-        """Given coefficients (q,) at these places, each normal with a standard
-        deviation of its ``scale``. Combinations of them that the data show no
-        better than rounding keep that."""
+    def conditional_on(self, places: Ints, scale: Floats) -> ConditionalData:
+        """The data conditional on coefficients at these places (q,), each with a
+        normal prior of standard deviation ``scale``. Combinations that the data
+        determine no better than rounding keep their prior."""
+        # Information of the coefficients in units of their prior: S I S = U diag(λ) Uᵀ.
         scaled = scale[:, None] * self.crossed(places)
         information, axes = np.linalg.eigh(scaled[:, places] * scale)
         information = shown(information)
+        # Marginalise: Σ = S U diag(1/(1 + λ)) Uᵀ S is removed from score and
+        # chi-square.
         shrunk = 1 / np.sqrt(1 + information)
         taken = shrunk[:, None] * (axes.T @ scaled)
         absorbed = shrunk * (axes.T @ (scale * self.score[places]))
@@ -135,10 +141,10 @@ class WeightedData:
 
 @dataclass(frozen=True, eq=False)
 class ConditionalData:
-    """What coefficients of given sizes leave: the ``score`` (C,) of all terms
-    and the sum of squares, ``chi2``; ``taken`` (q,C), whose square is the
-    information that they take; ``half_log_det``, half the logarithm of the
-    determinant of their precision."""
+    """The data conditional on coefficients of given sizes: the ``score`` (C,) of all
+    terms, and ``chi2``; ``taken`` (q,C) such that ``takenᵀ taken`` is the information
+    removed; ``half_log_det`` is half the log determinant of the coefficients'
+    precision."""
 
     data: WeightedData
     score: Floats
@@ -156,14 +162,13 @@ class ConditionalData:
         return matrix - _squared(self.taken[:, places]) if len(self.taken) else matrix
 
     def crossed(self, places: Ints) -> Floats:
-        """(q,C) the information that further coefficients have in common with
-        all."""
+        """(q,C) cross information of further coefficients with all."""
         return self.data.crossed(places) - self.taken[:, places].T @ self.taken
 
     def in_own_axes(self, places: Ints) -> tuple[Floats, Floats]:
-        """Of further terms, with coefficients at ``places`` (t,q), one by one:
-        eigenvalues (t,q) of the information, and the squared scores along its
-        axes."""
+        """Eigenvalues (t,q) of the information of single further terms with
+        coefficients at ``places`` (t,q), and their squared scores along the
+        eigenvectors."""
         matrix = self.information(places)
         if places.shape[1] == 1:
             return np.maximum(matrix[:, 0], 0.0), self.score[places] ** 2
@@ -172,14 +177,16 @@ class ConditionalData:
 
 
 def weighted(parts: Sequence[UnmodelledPart], columns: TermColumns, rows: LinearisedData) -> list[WeightedData]:
-    """Under each part. Those of one kind may have axes in common, and those
-    that leave all rows alike their weights."""
+    """The data under each part. Parts of one kind may share axes, and kinds of low
+    rank share the weights of the rows."""
+    # Project the columns off the nine parameters, once for all parts.
     beyond = columns.with_base(rows.beyond_linear(columns.base))
     unweighted = WeightedColumns(beyond, np.ones(len(rows.y)))
     taus: dict[UnmodelledCovariance | None, list[float]] = defaultdict(list)
     for part in parts:
         taus[part.kind].append(part.tau)
     out: list[WeightedData] = []
+    # Per kind: its covariance, and the precision for each size tau.
     for kind, of_kind in taus.items():
         of_rows = LowRank(np.empty((len(rows.y), 0))) if kind is None else kind.of_rows
         alike = isinstance(of_rows, LowRank)
@@ -192,8 +199,8 @@ def weighted(parts: Sequence[UnmodelledPart], columns: TermColumns, rows: Linear
 
 
 def shown(information: Floats) -> Floats:
-    """Eigenvalues, ascending, of one matrix, with zero for those that are none
-    but for rounding."""
+    """Eigenvalues of one matrix, ascending; those within rounding of zero become
+    zero."""
     least = information.shape[-1] * np.finfo(float).eps * information[..., -1:]
     return np.where(information > least, information, 0.0)
 
@@ -203,15 +210,14 @@ def _squared(columns: Floats) -> Floats:
     return np.asarray(columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2))
 
 
-# How well a set of terms, beside an unmodelled part, accounts for the rows: the
-# logarithm of its evidence.
+# The log evidence of a set of terms with an unmodelled part.
 
 
 @dataclass(frozen=True, eq=False)
 class SetEvidence:
-    """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k
-    terms: ``log`` (P,S) joint with the priors of part, sizes and members,
-    ``mean`` (P,q) of the scaled coefficients of all members, over the sizes."""
+    """The evidence of one set, for ``parts`` (P,) and sizes (S,k) of its k terms:
+    ``log`` (P,S) evidence times the priors of part, sizes and members, and ``mean``
+    (P,q) posterior means of the scaled coefficients, averaged over the sizes."""
 
     members: tuple[int, ...]
     parts: tuple[int, ...]
@@ -225,12 +231,12 @@ class SetEvidence:
 
     @cached_property
     def by_part(self) -> Floats:
-        """(P,) logarithms."""
+        """(P,) log evidence, summed over the sizes."""
         return np.asarray(log_sum_exp(self.log, axis=1))
 
     @cached_property
     def part_probabilities(self) -> Floats:
-        """(P,) of each part, if this set is the one."""
+        """(P,) posterior of the parts, given this set."""
         return np.asarray(np.exp(self.by_part - self.total))
 
     @property
@@ -240,14 +246,14 @@ class SetEvidence:
 
 
 class Evidence:
-    """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them
-    all, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
+    """The evidence of sets of ``terms``: the ``rows``, the ``columns`` (N,C) of all
+    terms, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
     effects in g."""
 
     def __init__(
         self, rows: LinearisedData, terms: Sequence[Term], odds: Odds, suspects: Sequence[int] | None = None
     ) -> None:
-        """Sizes begin at that share of the noise of a pose which the odds have;
+        """The smallest size is a share (of the odds) of the noise of a pose;
         ``suspects`` as in `parts_of`."""
         self.rows, self.odds = rows, odds
         self.columns = TermColumns.of([term.columns for term in terms], len(rows.y))
@@ -258,6 +264,7 @@ class Evidence:
         self.parts = parts_of(rows, odds, suspects)
         self._begin_sizes(odds.smallest * rows.median_standard_error)
         self.log_prior = np.array([term.log_prior for term in terms])
+        # Group terms of one rank, so that each group is one batched operation.
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self._data = weighted(self.parts, self.columns, rows)
         ranks = np.array([term.rank for term in terms], dtype=int)
@@ -273,34 +280,37 @@ class Evidence:
         self._sizes_of = np.array([gross if term.effect is None else self.sizes for term in self.terms])
 
     def resized(self, smallest_g: float) -> Evidence:
-        """The same, with sizes that begin elsewhere."""
+        """The same evidence with a grid of sizes from ``smallest_g``."""
         other = copy(self)
         other._begin_sizes(smallest_g)
         return other
 
     def precision(self, part: int) -> RowPrecision:
-        """Of the rows over their errors: noise and unmodelled part."""
+        """The inverse covariance of the rows over their errors: noise and unmodelled
+        part."""
         assumed = self.parts[part]
         of_rows = LowRank(np.empty((len(self.rows.y), 0))) if assumed.kind is None else assumed.kind.of_rows
         return of_rows.precision(assumed.tau)
 
     def places(self, members: Sequence[int]) -> Ints:
-        """Where the scaled coefficients of these terms stand among those of
-        all, and their ``columns``."""
+        """Indices of the scaled coefficients of these terms among those of all."""
         ranges = [np.arange(self._ends[i], self._ends[i + 1]) for i in members]
         return np.concatenate([np.empty(0, dtype=int), *ranges])
 
     def log_evidence_with_each(
         self, part: int, members: Sequence[int] = (), sizes: Sequence[float] = ()
     ) -> tuple[Floats, float]:
-        """Logarithms (T,R) of the evidence of each term at each size beside
-        ``members`` of given sizes, and that of these alone; with the priors of
-        the part and of the term's size, without those of names."""
+        """Log evidence (T,R) of each term at each size together with ``members`` of
+        given sizes, and that of the members alone; with the priors of the part and of
+        the term's size, without those of names."""
+        # Condition on the members, then add single terms in their eigenbasis.
         given = self._conditional_on(part, members, sizes)
         base = self.parts[part].log_prior + self._data[part].half_log_weight - given.half_log_det
         out = np.empty((len(self.terms), len(self.sizes)))
         for index, places in self._by_rank:
             information, along = given.in_own_axes(places)
+            # A coefficient of prior ρ² and information λ lowers χ² by ρ² s² / (1 + ρ²
+            # λ), and costs ½ ln(1 + ρ² λ).
             squared = self._sizes_of[index][:, :, None] ** 2
             spread = 1 + squared * information[:, None, :]
             gain = np.sum(squared / spread * along[:, None, :], axis=2)
@@ -316,9 +326,9 @@ class Evidence:
         term: tuple[int, float],
         outliers: Sequence[int],
     ) -> Floats:
-        """(o,) by how much a term of this size lowers the sum of squares beside
-        ``members`` of given sizes, without the rows of each of the
-        ``outliers``."""
+        """(o,) reduction in chi-square by a term of this size, conditional on
+        ``members`` of given sizes, without the rows of each of the ``outliers``."""
+        # Schur complement: a free coefficient for the row of the outlier removes it.
         given = self._conditional_on(part, members, sizes)
         own, rows = self.places([term[0]]), np.array([self.places([i]) for i in outliers])
         crossed = given.crossed(own)[:, rows].transpose(1, 0, 2)
@@ -327,38 +337,42 @@ class Evidence:
         information, score = given.normal_equations(own)
         information = information - through @ crossed.transpose(0, 2, 1)
         score = score - np.einsum("oqr,or->oq", through, given.score[rows])
+        # Ridge estimate with the prior of the term: sᵀ (1/ρ² + I)⁻¹ s.
         shrunk = np.linalg.inv(np.eye(len(own)) / term[1] ** 2 + information)
         return np.asarray(np.einsum("oq,oqp,op->o", score, shrunk, score))
 
     def normal_equations(
         self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
     ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
-        """Of ``each`` term the information (q,q) and score (q,) of its scaled
-        coefficients beside ``members`` of these sizes, and the sum of squares
-        that these leave."""
+        """Information (q,q) and score (q,) of the scaled coefficients of ``each``
+        term, conditional on ``members`` of these sizes; and the chi-square of
+        these."""
         given = self._conditional_on(part, members, sizes)
         return {i: given.normal_equations(self.places([i])) for i in each}, given.chi2
 
     def _conditional_on(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> ConditionalData:
-        """What ``members`` of these sizes leave under a part."""
+        """The data under a part, conditional on ``members`` of these sizes."""
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
-        return self._data[part].beside(self.places(members), scale)
+        return self._data[part].conditional_on(self.places(members), scale)
 
     def with_each_further(self, found: SetEvidence, row: int) -> Floats:
-        """(T,R) about the logarithm of the evidence of a set with each further
-        term at each size, under the part in this ``row`` of it: by the ratio at
-        those sizes of the members that are best without the term."""
+        """Approximate log evidence (T,R) of a set with each further term at each
+        size, under the part in this ``row``: the ratio at those sizes of the members
+        that are best without the term."""
         best = found.sizes[int(np.argmax(found.log[row]))]
         with_each, without = self.log_evidence_with_each(found.parts[row], found.members, best)
         return np.asarray(found.by_part[row] + with_each - without)
 
     def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
-        """Sizes of three and more terms go by every second step of the grid."""
+        """The evidence of one set under some ``parts``. Sets of three or more terms
+        use every second size of the grid."""
         first, step = (0, 1) if len(members) < 3 else (1, 2)
+        # All combinations of one size for each member.
         grids = [self._sizes_of[i][first::step] for i in members]
         sizes = np.array(list(itertools.product(*grids)), dtype=float)
         index = self.places(members)
         prior = float(self.log_prior[list(members)].sum()) - sum(np.log(len(grid)) for grid in grids)
+        # Information and score of the members under each part.
         information = np.empty((len(parts), len(index), len(index)))
         score = np.empty((len(parts), len(index)))
         chi2, base = np.empty((2, len(parts), 1))
@@ -367,6 +381,8 @@ class Evidence:
             information[row], score[row] = data.normal_equations(index)
             chi2[row] = data.chi2
             base[row] = self.parts[part].log_prior + data.half_log_weight + prior
+        # Integrate the coefficients out, for all sizes; then the noise
+        # (`log_likelihood`).
         gain, log_det, mean = _marginalised(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
         return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", softmax(log, axis=1), mean))
@@ -375,18 +391,18 @@ class Evidence:
 def _marginalised(
     information: Floats, score: Floats, ranks: Sequence[int], grids: Sequence[Floats]
 ) -> tuple[Floats, Floats, Floats]:
-    """Of coefficients in blocks of these ``ranks``, with ``information``
-    (P,q,q) and ``score`` (P,q), for every choice S of one size for each block
-    from its grid: by how much they lower the sum of squares (P,S), the
-    logarithm of the determinant of their precision over that of the prior
-    (P,S), and their mean (P,S,q).
+    """Gaussian integral over coefficients in blocks of these ``ranks``, with
+    ``information`` (P,q,q) and ``score`` (P,q), for all S choices of one size per
+    block from its grid: reduction in chi-square (P,S), log determinant of the
+    precision over that of the prior (P,S), and posterior mean (P,S,q).
 
-    Block by block: in the axes of its own information every size is a division,
-    and the rest is what it leaves.
+    The blocks are eliminated one by one. In the eigenbasis of a block's information
+    each size is a division; the Schur complement is left for the other blocks.
     """
     if not ranks:
         nothing = np.zeros((len(score), 1))
         return nothing, nothing, np.zeros((len(score), 1, 0))
+    # Eigenbasis of the first block: precision 1/ρ² + λ for every size ρ.
     r, squared = ranks[0], grids[0][:, None] ** 2
     value, axes = np.linalg.eigh(information[:, :r, :r])
     spread = 1 + squared * shown(value)[:, None]
@@ -395,13 +411,16 @@ def _marginalised(
     gain, log_det = np.sum(shrunk * along[:, None] ** 2, axis=2), np.log(spread).sum(axis=2)
     if len(ranks) == 1:
         return gain, log_det, (shrunk * along[:, None]) @ axes.transpose(0, 2, 1)
+    # Schur complement of the first block, for every size.
     crossed = axes.transpose(0, 2, 1) @ information[:, :r, r:]
     taken = shrunk[..., None] * crossed[:, None]
     rest = information[:, None, r:, r:] - crossed.transpose(0, 2, 1)[:, None] @ taken
     left = score[:, None, r:] - np.einsum("psrq,pr->psq", taken, along)
+    # The rest recursively, with (parts × sizes) as the new first dimension.
     P, R, q = left.shape
     more, more_det, others = _marginalised(rest.reshape(P * R, q, q), left.reshape(P * R, q), ranks[1:], grids[1:])
     others = others.reshape(P, R, -1, q)
+    # Back substitution for the mean of the first block.
     own = shrunk[:, :, None] * (along[:, None, None] - np.einsum("prq,pstq->pstr", crossed, others))
     mean = np.concatenate([np.einsum("pqr,pstr->pstq", axes, own), others], axis=3)
     gain = gain[..., None] + more.reshape(P, R, -1)

@@ -1,5 +1,5 @@
-"""The data: misfits of |a| in the pose means and slopes of |a| inside the
-poses, linearised once for all hypotheses."""
+"""The data: misfits of |a| in the pose means and slopes of |a| inside the poses,
+linearised once for all hypotheses."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ from triaxcal.poses.noise_spectrum import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 QUIETEST = 0.1
-"""Of the median: a pose without scatter (a logger's dead band) would weigh
-without end."""
+"""Smallest error as a share of the median: a pose without scatter (a logger's dead
+band) would have infinite weight."""
 CHI2_LOG = np.linspace(-8.0, 70.0, 12000)
-"""Where the likelihood of a sum of squares is looked up, by its logarithm."""
+"""Grid of the logarithm of chi-square on which the likelihood is tabulated."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearisedData:
-    """N rows, first the n means, then the n slopes where the poses know theirs,
-    each over its standard error.
+    """N rows: the n means, then the n slopes where these are known, each divided by
+    its standard error.
 
-    ``places`` (n,) are those of the poses among all that were given. ``y`` (N,)
+    ``places`` (n,) are the indices of the poses among all given. ``y`` (N,) are
     misfits, ``linear`` (N,9) derivatives by the nine parameters with columns of
-    length one, ``lengths`` (9,) what they were divided by, ``error`` (N,)
-    standard errors in units of the reference. ``basis`` (N,9) is an orthonormal
-    basis of what the nine take, and ``left`` (N,) the misfits without that.
-    ``run`` (n,) is the recording that each pose is of. ``point`` is where all
-    was linearised, with effects where these are large, and ``state`` its nine
-    parameters.
+    length one, ``lengths`` (9,) the divisors, ``error`` (N,) standard errors in units
+    of the reference. ``basis`` (N,9) is an orthonormal basis of the linear columns,
+    ``left`` (N,) the misfits after projection off it. ``run`` (n,) is the recording
+    of each pose. ``point`` is the point of linearisation, with effects where these
+    are large; ``state`` has its nine parameters.
     """
 
     poses: Sequence[Pose]
@@ -62,12 +61,13 @@ class LinearisedData:
     def of(
         cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
     ) -> LinearisedData:
-        """About the ``linear`` fit of these poses, which excludes outliers,
-        with the covariates that these ``effects`` need. Poses with a fault are
-        excluded. Raises as `triaxcal.estimate.initial_estimate.started_problem`
-        does; Refused where no degree of freedom is left."""
+        """Rows about the ``linear`` fit of these poses, with the covariates of the
+        ``effects``. Poses with a fault are excluded. Raises as
+        `triaxcal.estimate.initial_estimate.started_problem`; Refused where no degree
+        of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]
+        # Creep is information in the slopes, and an error of the means without them.
         poses = without_creep(sound) if np.isfinite([p.slope_error for p in sound]).all() else sound
         problem, _ = started_problem(poses, signs=signs, reference=linear.reference, effects=effects)
         slopes = PoseSlopes.of(problem, poses)
@@ -75,30 +75,34 @@ class LinearisedData:
         return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
 
     def relinearised_at(self, point: State) -> LinearisedData:
-        """The same rows, linearised elsewhere: coefficients count from zero
-        there too."""
+        """The same rows linearised at another point; coefficients still count from
+        zero."""
         return self._about(point, self.poses, self.places, self.problem)
 
     @classmethod
     def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> LinearisedData:
+        # Residuals at the measured outputs; derivatives in the attitudes of the model.
         r, _, error = linearise_all(problem, point)
         _, J, _ = linearise_all(in_attitude(problem, point), point)
+        # Refer the residuals to coefficients of zero.
         r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
         if len(r) <= LINEAR:
             raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
-        error = np.concatenate([_not_too_quiet(error[:n]), _not_too_quiet(error[n:])])
+        error = np.concatenate([_floored(error[:n]), _floored(error[n:])])
+        # Divide by the errors, scale the columns, and project the misfits.
         columns = J / error[:, None]
         lengths = np.linalg.norm(columns, axis=0)
         columns = columns / lengths
         basis = span(columns)
         y, noise = -r / error, noise_levels(poses)
+        # Tabulate the likelihood of chi-square, marginal over the noise level.
         likelihood = noise.log_likelihood(np.exp(CHI2_LOG), len(y) - basis.shape[1])
         run, left = np.array([p.run.index for p in poses]), y - basis @ (basis.T @ y)
         return cls(poses, places, run, problem, point, y, columns, lengths, error, basis, left, noise, likelihood)
 
     def of_future_poses(self, poses: Sequence[Pose]) -> LinearisedData:
-        """Of poses that nobody has taken, about the same point and in the same
-        units: misfits are not known, and there is no ``basis``."""
+        """Rows of hypothetical poses about the same point and in the same units:
+        without misfits and ``basis``."""
         sensor = self.state.sensor(self.problem)
         every = channels_of([*self.poses, *poses], self.problem.channel_reference)
         channels = {name: values[self.n :] for name, values in every.items()}
@@ -127,12 +131,12 @@ class LinearisedData:
         )
 
     def beyond_linear(self, columns: Floats) -> Floats:
-        """(N,…) what the nine parameters leave of columns."""
+        """(N,…) columns after projection off the nine parameters."""
         return np.asarray(columns - self.basis @ (self.basis.T @ columns))
 
     @property
     def residual_dof(self) -> int:
-        """Degrees of freedom that the nine parameters leave."""
+        """Degrees of freedom after the nine parameters."""
         return len(self.y) - int(self.basis.shape[1])
 
     def by_coefficients(self, effect: Effect) -> Floats:
@@ -146,14 +150,14 @@ class LinearisedData:
 
     @cached_property
     def _known(self) -> dict[int, tuple[Effect, Floats]]:
-        """What was asked before, of effects that stay alive so long: those of
-        other packages need not be equal to themselves."""
+        """Cached columns. The effects are kept alive with them, because foreign
+        effects need not equal themselves."""
         return {}
 
     @cached_property
     def _radii(self) -> list[tuple[Problem, Radius]]:
-        """Where effects are asked: in the means, and inside the poses where
-        these know their slopes."""
+        """The points of evaluation of effects: the means, and places inside the poses
+        where slopes are known."""
         there = in_attitude(self.problem, self.point)
         problems = [there, *([] if there.slopes is None else [there.slopes.inside])]
         return [(p, self.point.sensor(p).radius(p.u, p.covariates)) for p in problems]
@@ -178,8 +182,7 @@ class LinearisedData:
 
     @property
     def order(self) -> Ints:
-        """(n,) the places of the poses as they were taken, recording by
-        recording."""
+        """(n,) order of the poses by recording and time."""
         return np.lexsort((self.t_s, self.run))
 
     @property
@@ -193,25 +196,25 @@ class LinearisedData:
         return np.array([p.end_s - p.start_s for p in self.poses])
 
     def noise_variance_given(self, chi2: float) -> float:
-        """The mean variance of the noise over the one stated, where a model
-        leaves this sum of squares."""
+        """Posterior mean of the noise variance over the stated one, for a model with
+        this chi-square."""
         known = self.noise.students_dof
         return (known + chi2) / (known + self.residual_dof)
 
     def log_likelihood(self, chi2: Floats) -> Floats:
-        """Of sums of squares in m degrees of freedom (any shape), but for a
-        constant; the size of the noise is known as far as the poses tell it."""
+        """Log likelihood, up to a constant, of chi-squares in ``residual_dof``
+        degrees of freedom (any shape), marginal over the noise level."""
         return np.interp(np.log(np.maximum(chi2, 1e-3)), CHI2_LOG, self.likelihood)
 
 
 def in_attitude(problem: Problem, point: State) -> Problem:
-    """The same poses, at all places, with the outputs that the model has in
-    their attitudes, where |a| is the reference.
+    """The same poses with the model's outputs in their attitudes, where |a| is the
+    reference.
 
-    Derivatives are those there. At the measured outputs they would know the
-    misfits: a constant, which is no more than nine parameters make of it, would
-    differ from that by what each pose is off, and terms that hold a little of
-    one would seem to fit whatever there is.
+    The derivatives are taken there. At the measured outputs they would depend on the
+    misfits: a constant would differ from its projection onto the nine parameters by
+    the misfit of each pose, and terms that contain a constant would seem to fit any
+    data.
     """
 
     def there(of: Problem) -> Problem:
@@ -224,11 +227,10 @@ def in_attitude(problem: Problem, point: State) -> Problem:
 
 
 def span(columns: Floats) -> Floats:
-    """(N,r) an orthonormal basis of what columns (N,p) span, but for what
-    rounding makes of columns that depend on each other."""
+    """(N,r) orthonormal basis of the columns (N,p), of their numerical rank."""
     axes, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(axes[:, size > max(columns.shape) * np.finfo(float).eps * size[0]])
 
 
-def _not_too_quiet(error: Floats) -> Floats:
+def _floored(error: Floats) -> Floats:
     return np.maximum(error, QUIETEST * np.median(error)) if len(error) else error

@@ -1,4 +1,5 @@
-"""The likeliest sets as a mixture, and the parameters that are reported of it."""
+"""The likeliest sets as a mixture, and its projection onto the reported
+parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.evidence.likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.row_covariance import RowPrecision, inverse_of
@@ -25,21 +26,23 @@ from triaxcal.poses.covariates import at_moment
 # likely set, part of the evidence and choice of sizes.
 
 NEGLIGIBLE_PROBABILITY = 1e-6
-"""The probability of a set that moves no average."""
+"""Sets of smaller probability do not change an average."""
 CELLS = 400
-"""Sets, with one part and one choice of sizes each, whose covariances are
-mixed: the likeliest. The others are as these are."""
+"""Number of cells (one set, one part, one choice of sizes) in the mixture, the
+likeliest. They represent the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A likely set, with one ``part`` of the evidence, under k choices of
-    ``sizes`` (k,q) of its q scaled coefficients. ``share`` (k,) is the
-    probability of each. Of the linear parameters and the coefficients, d = 9 +
-    q, ``conditional_mean`` (k,d) are the means and ``conditional_covariance``
-    (k,d,d) the covariances but for the ``noise`` (k,); ``residuals`` (k,N) the
-    rows that are left, ``design`` (N,d) the derivatives of the rows and
-    ``inverse`` (N,N) that of their covariance."""
+    """A likely set with one ``part`` of the evidence, under k choices of ``sizes``
+    (k,q) of its q scaled coefficients.
+
+    ``share`` (k,) is the probability of each choice. For the d = 9 + q linear
+    parameters and coefficients, ``conditional_mean`` (k,d) are the means and
+    ``conditional_covariance`` (k,d,d) the covariances in units of the noise variance
+    ``noise`` (k,). ``residuals`` (k,N) are those of the rows, ``design`` (N,d) the
+    derivatives of the rows, ``inverse`` (N,N) the inverse of their covariance.
+    """
 
     found: SetEvidence
     names: frozenset[str]
@@ -56,12 +59,13 @@ class Components:
 
 
 def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
-    """Of the likeliest cells that hold this ``share`` of the probability, those
-    of one set and part together."""
+    """The likeliest cells that hold this ``share`` of the probability, grouped by set
+    and part."""
     evidence = posterior.evidence
     rows = evidence.rows
     together: dict[tuple[int, int], list[tuple[float, int]]] = defaultdict(list)
     sets: dict[int, SetEvidence] = {}
+    # Group the cells of one set and part: they share design and covariance.
     for log_share, found, row, cell in _likely_cells(posterior, share):
         sets[id(found)] = found
         together[id(found), row].append((np.exp(log_share), cell))
@@ -72,6 +76,8 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
         part, places = found.parts[row], evidence.places(found.members)
         if part not in inverse:
             inverse[part] = evidence.precision(part)
+        # Generalised least squares with a normal prior on the coefficients: C = (Xᵀ P X
+        # + diag(0, ρ⁻²))⁻¹, mean = C Xᵀ P y.
         design = np.concatenate([rows.linear, evidence.columns.at(places)], axis=1)
         weighted = design.T @ inverse[part]
         of, chosen = np.array([p for p, _ in cells]), [cell for _, cell in cells]
@@ -81,6 +87,7 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
         precision[:, own, own] += sizes**-2.0
         within = inverse_of(precision)
         here = within @ (weighted @ rows.y)
+        # Posterior of the noise variance from chi-square at the mean.
         left = rows.y - here @ design.T
         chi2 = np.maximum(left @ (inverse[part] @ rows.y), 0.0)
         noise = np.array([rows.noise_variance_given(float(of_cell)) for of_cell in chi2])
@@ -90,9 +97,10 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
 
 
 def _likely_cells(posterior: Posterior, share: float) -> list[tuple[float, SetEvidence, int, int]]:
-    """The logarithm of its probability, the set, and the places of part and
+    """The likeliest cells: log probability, set, and the indices of part and
     sizes."""
     total = float(log_sum_exp([found.total for found in posterior.sets]))
+    # The best cells of every set that is not negligible, then the best of all.
     log, of_set, where = [], [], []
     for k, found in enumerate(posterior.sets):
         if found.total - total < np.log(NEGLIGIBLE_PROBABILITY):
@@ -109,26 +117,27 @@ def _likely_cells(posterior: Posterior, share: float) -> list[tuple[float, SetEv
     return [(float(p), posterior.sets[k], *divmod(int(i), posterior.sets[k].log.shape[1])) for p, k, i in chosen]
 
 
-# From the coefficients of every term to the parameters of a document, which has one
+# From the coefficients of all terms to the parameters of a document, which has one
 # form and one shape for each effect.
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Maps the scaled coefficients of every term to deviations of the reported
-    parameters: ``by_term`` (9+p,C), zero for outliers. ``effects`` are those
-    listed, each in the form and the shape that stands for its name, and
-    ``columns`` (N,p) theirs. An effect that is not listed is projected onto the
-    nine parameters."""
+    """Linear map from the scaled coefficients of all terms to deviations of the
+    reported parameters: ``by_term`` (9+p,C), zero for outliers. ``effects`` are the
+    listed ones, each in its representative form and shape; ``columns`` (N,p) are
+    their derivatives. An effect that is not listed is projected onto the nine
+    parameters."""
 
     effects: tuple[Effect, ...]
     columns: Floats
     by_term: Floats
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> Projection:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, likeliest: Sequence[Effect]) -> Projection:
         evidence = posterior.evidence
         rows = evidence.rows
+        # Compare effects in the poses, and in readings of the next recording.
         there = NextReadings.of(posterior, at, np.array([v for _, v in cube_directions()]))
         each = [_derivatives(posterior, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
@@ -137,6 +146,8 @@ class Projection:
         of_name = {effect.name: k for k, effect in enumerate(likeliest)}
         nothing = np.empty((len(linear), 0))
         known: dict[int, Floats] = {}
+        # Least-squares projection of each term's columns onto the nine parameters and
+        # its representative.
         for i in sorted({i for found in posterior.sets for i in found.members}):
             term = evidence.terms[i]
             if term.effect is None:
@@ -152,13 +163,17 @@ class Projection:
                 )
             found = known[id(term.effect)][:, list(term.kept)] * term.combination
             own: list[int] = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
+            # Scatter the result into the rows of the nine parameters and of that
+            # effect.
             by_term[np.ix_(np.array([*range(9), *own]), evidence.places([i]))] = found
+        # Undo the scaling of the linear columns.
         by_term[:9] /= rows.lengths[:, None]
         columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
         return cls(tuple(likeliest), columns, by_term)
 
-    def beside(self, posterior: Posterior, effect: Effect) -> Projection:
-        """With a further effect, which no term projects onto."""
+    def with_effect(self, posterior: Posterior, effect: Effect) -> Projection:
+        """The same projection with a further effect, onto which no term is
+        projected."""
         own = posterior.evidence.rows.by_coefficients(effect)
         nothing = np.zeros((own.shape[1], self.by_term.shape[1]))
         return Projection(
@@ -169,8 +184,8 @@ class Projection:
 
 
 def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
-    """(9+p,q): the deviation of the linear parameters, and the coefficients,
-    that come nearest to a unit of each."""
+    """(9+p,q): linear parameters and coefficients that approximate a unit of each
+    column best (least squares)."""
     size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
     found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
     found[linear.shape[1] :] /= size[:, None]
@@ -178,16 +193,16 @@ def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
 
 
 def _derivatives(posterior: Posterior, effect: Effect, there: NextReadings) -> Floats:
-    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of
-    |a| in the next recording."""
+    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a|
+    in the next recording."""
     return np.concatenate([posterior.evidence.rows.by_coefficients(effect), there.by_coefficients(effect)])
 
 
 @dataclass(frozen=True, eq=False)
 class NextReadings:
-    """M readings, as of the next recording: their ``geometry``, derivatives of
-    |a| by the ``linear`` parameters (M,9), and the ``covariates``. All of |a| is
-    over the ``error`` of a pose."""
+    """M readings of the next recording: their ``geometry``, derivatives of |a| by the
+    ``linear`` parameters (M,9), and the ``covariates``. All quantities of |a| are
+    divided by the ``error`` of a pose."""
 
     geometry: ReadingGeometry
     linear: Floats
@@ -195,7 +210,7 @@ class NextReadings:
     error: float
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, directions: Floats) -> NextReadings:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, directions: Floats) -> NextReadings:
         rows = posterior.evidence.rows
         up = directions * rows.problem.reference
         found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
@@ -204,7 +219,7 @@ class NextReadings:
         return cls(found, found.linear / error, covariates, error)
 
     def by_coefficients(self, effect: Effect) -> Floats:
-        """(M,p)"""
+        """(M,p) derivatives of |a| by the coefficients of an effect."""
         try:
             basis = effect.basis(self.geometry.along, self.covariates)
             return np.asarray(np.einsum("ni,nip->np", self.geometry.by_bias, basis) / self.error)

@@ -1,9 +1,10 @@
-"""What is corrected: the linear parameters and the effects' coefficients,
-averaged over all likely sets.
+"""The correction: linear parameters and coefficients of effects, averaged over all
+likely sets.
 
-A document has one form and one shape for each effect. So every shape of a name
-is carried over to the likeliest one: the coefficients are those that come
-nearest, in the poses and in the next recording, to what all shapes together do."""
+A document has one form and one shape for each effect. So every shape of a name is
+projected onto the likeliest one: the coefficients approximate the sum of all shapes
+best, in the poses and in the next recording.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from triaxcal.arrays import Floats, rms
 from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
-from triaxcal.estimate.calibration import HoldsAt, Unmodelled
+from triaxcal.estimate.calibration import ReferenceEpoch, Unmodelled
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
 from triaxcal.evidence.mixture import NEGLIGIBLE_PROBABILITY, Components, Projection, components
 from triaxcal.evidence.over_sphere import OverSphere, Smooth
@@ -29,20 +30,18 @@ from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.rounding import reaches
 
 # The covariance of a model average: within each set, part and choice of sizes, and
-# between them.
+# between them (law of total covariance).
 
 BIAS = slice(3, 6)
-"""Of the nine parameters as the fit has them: those to which a bias adds
-unscaled."""
+"""The parameters of the search to which a bias adds unscaled."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Of the parameters as deviations: the ``whole`` covariance (9+p,9+p), of
-    which ``thermal`` is the part of sets with a thermal effect that is not
-    listed; ``prior`` (p,) are the variances of the coefficients before the
-    poses were seen."""
+    """Covariances of the parameters as deviations: the ``whole`` covariance
+    (9+p,9+p), its part ``thermal`` from sets with an unlisted thermal effect, and
+    ``prior`` (p,), the prior variances of the coefficients."""
 
     whole: Floats
     thermal: Floats
@@ -59,12 +58,13 @@ class Spread:
         t_s: float,
         sphere: OverSphere | None = None,
     ) -> Spread:
-        """Within each set, part and choice of sizes, and between them. The
-        biases are those of the moment, with what a process in time adds. With a
-        ``sphere``, the last effect of the ``projection`` is its smooth term."""
+        """Covariance within and between cells. The biases are those of the epoch
+        ``t_s``, with the contribution of a process in time. With a ``sphere``, the
+        last effect of the ``projection`` is its smooth term."""
         listed = {effect.name for effect in projection.effects}
         whole, thermal = np.zeros((2, len(mean), len(mean)))
         prior, total = np.zeros(len(mean) - LINEAR), 0.0
+        # Sum the second moments about the mean over all cells, by their probability.
         for cells in mixture:
             size, here = _moments(cells, posterior, mean, projection, process_bias, t_s, sphere)
             total += float(cells.share.sum())
@@ -76,8 +76,7 @@ class Spread:
 
 
 def _sound(covariance: Floats) -> Floats:
-    """Where combinations are hardly known, rounding may leave less than nothing
-    of the others."""
+    """The nearest covariance without negative variances, which rounding may leave."""
     if (np.diag(covariance) >= 0).all():
         return covariance
     size, axes = np.linalg.eigh(covariance)
@@ -87,8 +86,8 @@ def _sound(covariance: Floats) -> Floats:
 def smooth_mean(
     posterior: Posterior, mixture: Sequence[Components], projection: Projection, sphere: OverSphere
 ) -> Floats:
-    """(h,) mean coefficients of the smooth term beside the parameters of a
-    ``projection``, which has no such term."""
+    """(h,) mean coefficients of the smooth term, conditional on the parameters of a
+    ``projection`` without such a term."""
     total, out = 0.0, np.zeros(len(sphere.harmonics))
     for cells in mixture:
         smooth = _smooth_of(cells, posterior, projection, projection.effects, sphere)
@@ -105,7 +104,7 @@ def _smooth_of(
 
 
 def _by_cells(cells: Components, posterior: Posterior, projection: Projection) -> Floats:
-    """(9+p,d) reported parameters by those of the cells."""
+    """(9+p,d) map from the parameters of the cells to the reported ones."""
     by_term = projection.by_term[:, cells.places]
     to = np.concatenate([np.zeros((len(by_term), LINEAR)), by_term], axis=1)
     to[:LINEAR, :LINEAR] += np.diag(1 / posterior.evidence.rows.lengths)
@@ -121,20 +120,24 @@ def _moments(
     t_s: float,
     sphere: OverSphere | None,
 ) -> tuple[Floats, Floats]:
-    """Sums over the choices, by their share: the variances (p,) that the sizes
-    give the coefficients of an average, and the second moments (9+p,9+p) about
-    its mean."""
+    """Sums over the choices of sizes, weighted by their probability: prior variances
+    (p,) of the coefficients, and second moments (9+p,9+p) about the mean of the
+    average."""
     rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
+    # Prior variance of the reported coefficients.
     to = _by_cells(cells, posterior, projection)
     size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
     added, wandering = np.zeros(len(mean)), np.zeros((len(mean), len(mean)))
+    # The smooth term, as a function of the cell's parameters and of the data.
     if sphere is not None:
         smooth = _smooth_of(cells, posterior, projection, projection.effects[:-1], sphere)
         own = slice(len(mean) - len(smooth.constant), len(mean))
         to[own], added[own], wandering[own, own] = smooth.by_parameters, smooth.constant, smooth.error
         size[own.start - LINEAR :] += cells.share.sum() * smooth.prior
+    # Deviation of the cell's mean from that of the average.
     off = cells.conditional_mean @ to.T + added - mean
     off[:, BIAS] -= process_bias
+    # A process in time predicts the bias at the epoch from the residuals.
     if assumed.kind is not None and assumed.kind.what is UnmodelledKind.TIME:
         there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
         off[:, BIAS] += cells.residuals @ there.T
@@ -142,50 +145,51 @@ def _moments(
             assumed.kind.scale * np.eye(3) - there @ assumed.kind.bias_at(rows, t_s).T
         )
         to[BIAS] -= there @ cells.design
+    # Within the cells, A C Aᵀ times the noise; between them, d dᵀ.
     shared = cells.share * cells.noise
     spread = to @ np.tensordot(shared, cells.conditional_covariance, axes=1) @ to.T + shared.sum() * wandering
     return size, spread + (cells.share[:, None] * off).T @ off
 
 
 NOTICEABLE = 0.1
-"""Of the standard error of a pose: a name that is unlikely and corrects less is
-not listed."""
+"""In standard errors of a pose: an unlikely name with a smaller correction is not
+listed."""
 SELECTED_LEAST = 0.03
-"""An unlikely name is dropped if its mean correction holds less than this share
-of its expected square: its coefficients would add uncertainty and hardly any
+"""An unlikely name is dropped if its mean correction holds less than this share of
+its expected square: its coefficients would add uncertainty and hardly any
 correction."""
 STEPS = 3
-"""Of Newton's method, for nine parameters a few parts in a thousand from where
-they go."""
+"""Gauss–Newton steps, for nine parameters a few parts in a thousand from the
+solution."""
 
 
 class Refusal(StrEnum):
-    """Why no effect is corrected."""
+    """The reason for no correction of effects."""
 
     UNMODELLED = "unmodelled"
-    """Something that no name describes probably acts: an average over names
-    would go with it where it must not."""
+    """An unmodelled part probably acts: an average over names would follow it under
+    the wrong conditions."""
     CHANGE_POINT = "another"
-    """One calibration does not hold in all poses: a unit was exchanged on the
-    way, or its channels."""
+    """The poses do not share one calibration: a unit or its channels were
+    exchanged."""
     ONE_POSE = "one_pose"
-    """A name is certain, and without some single pose unlikelier than not."""
+    """A name is certain, but has a probability below one half without some single
+    pose."""
     GAIN = "gain"
-    """No name is certain, and the expected error would fall too little."""
+    """No name is certain, and the expected error would decrease too little."""
 
 
 @dataclass(frozen=True, eq=False)
 class Average:
-    """``sensor`` has one entry for each likely name, by the mean of its
-    coefficients: sets without the effect count, with zero. Its biases hold what
-    a process in time adds to them at the moment for which all this holds.
-    ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases
-    and coefficients, within the sets and between them, of which ``thermal`` is
-    the part of sets with a thermal effect that is not listed; ``prior_sd`` (p,)
-    are the coefficients' standard deviations before the poses were seen, as the
-    probabilities and sizes after have them. ``weights`` has the probability of
-    each name. ``loss`` is the expected mean square of |a| over the sphere in
-    the next recording, over the error of a pose, NaN where nobody asked."""
+    """``sensor`` has one entry for each likely name, with the mean of its
+    coefficients; sets without the effect count as zero. Its biases contain the
+    process in time at the reference epoch. ``covariance`` (9+p,9+p) of scale factors,
+    misalignments, biases and coefficients is taken within the sets and between them;
+    ``thermal`` is its part from sets with an unlisted thermal effect; ``prior_sd``
+    (p,) are prior standard deviations of the coefficients under the posterior
+    probabilities and sizes. ``weights`` are the probabilities of the names. ``loss``
+    is the expected mean square error of |a| over the sphere in the next recording, in
+    units of the error of a pose; NaN where not computed."""
 
     sensor: Sensor
     covariance: Floats
@@ -208,24 +212,25 @@ def refusal(posterior: Posterior) -> Refusal | None:
     return None
 
 
-def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | None = None) -> Average:
-    """Over all sets, sizes and parts, of what has a name; it holds for another
-    recording as at a moment of this one. ``mixture`` are the likeliest sets
-    (`components`), where they are known."""
+def average(posterior: Posterior, at: ReferenceEpoch, mixture: Sequence[Components] | None = None) -> Average:
+    """The average over all sets, sizes and parts of the named effects, for the epoch
+    ``at``. ``mixture`` are the likeliest sets (`components`), where already known."""
     mixture = components(posterior) if mixture is None else mixture
     return _of_likely(posterior, None, at, mixture)
 
 
 def least_loss(
-    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]
+    posterior: Posterior, at: ReferenceEpoch, linear: Sensor, mixture: Sequence[Components]
 ) -> tuple[Average, Refusal | None]:
-    """What is handed on, and why no name is corrected in it. Of the ``linear``
-    sensor and the averages that the posterior allows (`refusal`), it is the one
-    with the least expected error. Names none of which is certain are corrected
-    only where the expected mean square falls far enough (`Odds.gain_by_names`)."""
+    """The correction with the least expected error, and the reason for no effects in
+    it. The candidates are the ``linear`` sensor and the averages that the posterior
+    allows (`refusal`). Names none of which is certain are corrected only where the
+    expected mean square decreases enough (`Odds.gain_by_names`)."""
     odds = posterior.evidence.odds
     sphere = OverSphere.of(posterior, at, mixture)
     alone = _linear_alone(posterior, at, linear, mixture, sphere)
+    # Named effects, if nothing forbids it: their loss against that of the linear
+    # sensor.
     why = refusal(posterior)
     if why is None:
         made = _of_likely(posterior, sphere, at, mixture)
@@ -236,11 +241,14 @@ def least_loss(
         return alone, Refusal.GAIN if likely else None
     if why is not Refusal.UNMODELLED:
         return alone, why
+    # A smooth function of direction, if an unmodelled part acts.
     whole = _smooth(posterior, sphere, at, mixture)
     return (whole if whole.loss <= odds.gain * alone.loss else alone), why
 
 
-def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mixture: Sequence[Components]) -> Average:
+def _of_likely(
+    posterior: Posterior, sphere: OverSphere | None, at: ReferenceEpoch, mixture: Sequence[Components]
+) -> Average:
     listed = _likeliest(posterior)
     made = _of_listed(posterior, sphere, at, listed, mixture)
     kept = [effect for effect in listed if _selected(posterior, made, effect)]
@@ -250,7 +258,7 @@ def _of_likely(posterior: Posterior, sphere: OverSphere | None, at: HoldsAt, mix
 def _of_listed(
     posterior: Posterior,
     sphere: OverSphere | None,
-    at: HoldsAt,
+    at: ReferenceEpoch,
     listed: Sequence[Effect],
     mixture: Sequence[Components],
 ) -> Average:
@@ -263,17 +271,18 @@ def _of_listed(
     return _with_errors(posterior, sphere, at, projection, moved, state, mean, process_bias, mixture)
 
 
-def _smooth(posterior: Posterior, sphere: OverSphere, at: HoldsAt, mixture: Sequence[Components]) -> Average:
-    """The sensor with the mean of all functions of the direction, and the nine
-    parameters that fit the poses best beside it. Between the poses a function
-    of the direction is interpolated. Effects of temperature, time or memory are
-    left out: if none of the hypotheses is true, nothing says that they hold
-    under other conditions."""
+def _smooth(posterior: Posterior, sphere: OverSphere, at: ReferenceEpoch, mixture: Sequence[Components]) -> Average:
+    """The sensor with the mean of all functions of direction as a smooth term, and
+    the nine parameters of the best fit with it; between the poses the function is
+    interpolated. Effects of temperature, time or memory are omitted: without a true
+    hypothesis nothing supports them under other conditions."""
     rows = posterior.evidence.rows
+    # Project effects of the force alone, then add the smooth term.
     projection = Projection.of(posterior, at, [e for e in _likeliest(posterior) if not e.needs])
     coefficients = _mean(posterior, projection)[0][LINEAR:]
     further = smooth_mean(posterior, mixture, projection, sphere)
-    projection, coefficients = projection.beside(posterior, sphere.smooth), np.concatenate([coefficients, further])
+    projection, coefficients = projection.with_effect(posterior, sphere.smooth), np.concatenate([coefficients, further])
+    # Fit the nine parameters to the poses that are no outliers.
     used = np.flatnonzero(posterior.outlier_probabilities < posterior.evidence.odds.reported)
     left = (rows.y - projection.columns @ coefficients)[used]
     nine = np.linalg.lstsq(rows.linear[used], left, rcond=None)[0] / rows.lengths
@@ -284,7 +293,7 @@ def _smooth(posterior: Posterior, sphere: OverSphere, at: HoldsAt, mixture: Sequ
 
 
 def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
-    """Whether a name is likely, or corrects a good part of what it may do."""
+    """Whether a name is likely, or corrects enough of its expected contribution."""
     if reaches(posterior.effect_probabilities[effect.name], posterior.evidence.odds.reported):
         return True
     ends = np.cumsum([LINEAR, *(len(q) for _, q in made.sensor.effects)])
@@ -298,10 +307,10 @@ def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
 
 
 def _linear_alone(
-    posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components], sphere: OverSphere
+    posterior: Posterior, at: ReferenceEpoch, linear: Sensor, mixture: Sequence[Components], sphere: OverSphere
 ) -> Average:
-    """The ``linear`` sensor with the errors that all likely sets make of it:
-    what is handed on where no effect is corrected."""
+    """The ``linear`` sensor with the errors from all likely sets: the result where no
+    effect is corrected."""
     rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
     projection, mean = Projection.of(posterior, at, []), state.theta - rows.state.theta
@@ -311,7 +320,7 @@ def _linear_alone(
 def _with_errors(
     posterior: Posterior,
     sphere: OverSphere | None,
-    at: HoldsAt,
+    at: ReferenceEpoch,
     projection: Projection,
     sensor: Sensor,
     state: State,
@@ -319,6 +328,7 @@ def _with_errors(
     process_bias: Floats,
     mixture: Sequence[Components],
 ) -> Average:
+    # Transform from theta to the reported parameters.
     G = parameters_by_theta(posterior.evidence.rows.problem, state)
     smooth = sphere if sphere is not None and sphere.smooth in projection.effects else None
     spread = Spread.of(posterior, mixture, mean, projection, process_bias, at.t_s, smooth)
@@ -326,26 +336,28 @@ def _with_errors(
     weights = {effect.name: probabilities[effect.name] for effect in projection.effects}
     loss, unmodelled = float("nan"), None
     if sphere is not None:
+        # Expected loss over the sphere, at the reported parameters.
         J, reported = sphere.by_parameters(posterior, projection.effects), mean.copy()
         reported[BIAS] += process_bias
         loss = sphere.loss(J @ reported)
-        # What the covariance of the parameters does not hold of |a|.
-        beside = loss - float(np.einsum("mi,ij,mj->", J, spread.whole, J, optimize=True)) / len(J)
-        unmodelled = _noticeable(np.array([beside, sphere.across]), sphere.there.error)
+        # Mean square error of |a| that the parameter covariance does not contain.
+        remaining = loss - float(np.einsum("mi,ij,mj->", J, spread.whole, J, optimize=True)) / len(J)
+        unmodelled = _noticeable(np.array([remaining, sphere.across]), sphere.there.error)
     return Average(
         sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, unmodelled, loss
     )
 
 
 def _noticeable(square: Floats, error: float) -> Unmodelled | None:
-    """Of mean squares over the ``error`` of a pose."""
+    """Unmodelled standard deviations from mean squares over the ``error`` of a pose;
+    None where both are negligible."""
     along, across = np.sqrt(np.maximum(square, 0.0)) * (square > NOTICEABLE**2) * error
     return Unmodelled(float(along), float(across)) if along or across else None
 
 
 def _likeliest(posterior: Posterior) -> list[Effect]:
-    """Of each name that is listed the form and the shape of the greatest
-    weight, the likeliest name first."""
+    """The form and shape of the greatest weight for each listed name, the likeliest
+    name first."""
     weight: dict[int, float] = defaultdict(float)
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
@@ -370,12 +382,13 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
 
 
 def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[int, Floats]]:
-    """(9+p,) deviations; and by part the rows that are left, weighted by the
-    inverse of their covariance."""
+    """(9+p,) mean deviations of the parameters; and by part the residuals, weighted
+    by the inverse of their covariance."""
     evidence = posterior.evidence
     rows = evidence.rows
     scaled = np.zeros(evidence.columns.count)
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
+    # Mean of the scaled coefficients; by part, the rows less the effects.
     for found, weight in zip(posterior.sets, posterior.set_probabilities, strict=True):
         if weight < NEGLIGIBLE_PROBABILITY:
             continue
@@ -386,6 +399,7 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
         columns = evidence.columns.at(places)
         for part, of_part, q in zip(found.parts, share, mean, strict=True):
             by_part[part] += of_part * rows.y - columns @ q
+    # Project onto the listed effects; the nine parameters by generalised least squares.
     deviation = projection.by_term @ scaled
     residuals: dict[int, Floats] = {}
     for part, target in by_part.items():
@@ -397,12 +411,13 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
 
 
 def _where_linearised(posterior: Posterior, deviation: Floats, projection: Projection) -> State:
-    """Adjust the nine parameters until the exact residuals are those of the
-    linear model. This absorbs the higher orders of the effects."""
+    """The state whose exact residuals equal those of the linear model, by adjustment
+    of the nine parameters. This absorbs the higher orders of the effects."""
     rows = posterior.evidence.rows
     wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
     state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)
     nearest, found = np.inf, state
+    # Gauss–Newton on the nine parameters, as long as the difference decreases.
     for _ in range(STEPS):
         with np.errstate(over="ignore", invalid="ignore"):  # where the poses show too little it may go anywhere
             r, _, _ = linearise_all(rows.problem, state, jacobian=False)

@@ -1,4 +1,5 @@
-"""What to record next: the poses and channels that are expected to tell most."""
+"""The next measurement: the poses and channels with the largest expected
+information."""
 
 from __future__ import annotations
 
@@ -25,15 +26,14 @@ from triaxcal.model.directions import cube_directions, elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import reaches
 
-# What the likely sets say of poses that nobody has taken: of each a normal
-# distribution, given all rows seen.
+# The predictive distribution of poses to come: a normal distribution for each likely
+# set, conditional on all rows.
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What a reader wants to know: which effects act, which poses are outliers,
-    from which pose on there is another unit (−1: from none), and with what
-    something goes that no name describes (None: with nothing)."""
+    """A hypothesis: the effects that act, the outliers, the pose from which on there
+    is another unit (−1: none), and the kind of unmodelled part (None: none)."""
 
     names: frozenset[str]
     outliers: frozenset[int]
@@ -43,11 +43,10 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """The likeliest sets, each with one part of the evidence and one choice of
-    sizes: C of them, of H hypotheses. ``weight`` (C,) adds up to one and gives
-    each hypothesis its share of the probability of all that have a cell here;
-    ``of`` (C,) is the place of each cell's hypothesis among the
-    ``hypotheses``."""
+    """The likeliest sets, each with one part of the evidence and one choice of sizes:
+    C cells of H hypotheses. ``weight`` (C,) sums to one and gives each hypothesis its
+    share of the probability of all that have a cell; ``of`` (C,) is the index of each
+    cell's hypothesis in ``hypotheses``."""
 
     posterior: Posterior
     mixture: Sequence[Components]
@@ -57,8 +56,7 @@ class Predictive:
 
     @classmethod
     def likeliest(cls, posterior: Posterior, share: float) -> Predictive:
-        """Those that hold this share of the probability, or as many as there
-        are."""
+        """The cells with this share of the probability, or all."""
         mixture = components(posterior, share)
         each = [_hypothesis(posterior, cells.found, cells.part) for cells in mixture]
         hypotheses = list(dict.fromkeys(each))
@@ -66,6 +64,7 @@ class Predictive:
         weight = np.concatenate([cells.share for cells in mixture])
         whole = probabilities(posterior)
         wanted = np.array([whole[h] for h in hypotheses])
+        # Rescale the cells so that each hypothesis has its full posterior probability.
         weight = weight * (wanted / np.bincount(of, weight))[of]
         return cls(posterior, mixture, weight / weight.sum(), hypotheses, of)
 
@@ -74,8 +73,7 @@ class Predictive:
         return np.array([float(name in h.names) for h in self.hypotheses])[self.of]
 
     def predicted(self, rows: LinearisedData) -> tuple[Floats, Floats]:
-        """Mean (C,M) and covariance (C,M,M) of M rows to come, over their
-        errors."""
+        """Mean (C,M) and covariance (C,M,M) of M future rows, over their errors."""
         evidence = self.posterior.evidence
         columns = _columns(evidence, sorted({i for cells in self.mixture for i in cells.found.members}), rows)
         here, there = PoseInputs.of(evidence.rows), PoseInputs.of(rows)
@@ -85,6 +83,8 @@ class Predictive:
             kind, tau = evidence.parts[cells.part].kind, evidence.parts[cells.part].tau
             if cells.part not in of_parts:
                 of_parts[cells.part] = _unmodelled(kind, tau, here, there, cells.inverse)
+            # Kriging for the unmodelled part, T = K(new, old) P, on top of the linear
+            # model.
             to, error = of_parts[cells.part]
             design = np.concatenate([rows.linear, columns[:, cells.places]], axis=1) - to @ cells.design
             mean.append(to @ evidence.rows.y + cells.conditional_mean @ design.T)
@@ -95,9 +95,9 @@ class Predictive:
 def _unmodelled(
     kind: UnmodelledCovariance | None, tau: float, here: PoseInputs, there: PoseInputs, inverse: RowPrecision
 ) -> tuple[Floats, Floats]:
-    """Of the rows to come, noise and what no term describes: the best linear
-    prediction (M,N) by the rows seen, of whose covariance this is the
-    ``inverse``, and the covariance (M,M) of its error."""
+    """Noise and unmodelled part of the future rows: best linear prediction (M,N) from
+    the known rows, with the ``inverse`` of their covariance, and the covariance (M,M)
+    of its error."""
     k, n = len(there.error), len(here.error)
     if kind is None:
         return np.zeros((k, n)), np.eye(k)
@@ -107,7 +107,7 @@ def _unmodelled(
 
 
 def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
-    """Of every hypothesis."""
+    """The posterior probability of every hypothesis."""
     out: dict[Hypothesis, float] = defaultdict(float)
     for weight, found in zip(posterior.set_probabilities, posterior.sets, strict=True):
         share = weight * found.part_probabilities
@@ -132,9 +132,8 @@ def _what(posterior: Posterior, part: int) -> UnmodelledKind | None:
 
 
 def _columns(evidence: Evidence, members: Sequence[int], rows: LinearisedData) -> Floats:
-    """(M,C) of all terms in the rows to come; zero of those that are no
-    ``members``, of outliers, and where an effect of another package does not
-    say what it adds."""
+    """(M,C) derivatives of the future rows by all terms; zero for terms outside
+    ``members``, for outliers, and where a foreign effect is not defined."""
     out = np.zeros((len(rows.y), evidence.columns.count))
     known: dict[int, Floats] = {}
     for i in members:
@@ -157,35 +156,31 @@ def _of_term(term: Term, rows: LinearisedData, known: dict[int, Floats]) -> Floa
     return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.combination)
 
 
-# What may be done next, and the pose that it would give: what a plan of more poses
-# chooses among.
+# The possible actions, and the pose that each would give.
 
 UNDECIDED_PROBABILITY = 0.02
-"""A name, or an outlier, of less probability is asked about by no action of its
-own."""
+"""Names and outliers of smaller probability get no action of their own."""
 FAR = 3.0
-"""Standard errors from the linear fit from which on a pose is one to take
-again."""
+"""Standard errors from the linear fit from which on a pose is a candidate for
+repetition."""
 AGAIN = 4
-"""Poses to take again by themselves, at most: those farthest off."""
+"""Number of poses that are candidates for repetition, the farthest off."""
 SAME = float(np.cos(np.radians(5.0)))
-"""The cosine between directions that are one: nobody points a unit much better
-by hand."""
+"""Cosine of the angle below which two directions count as one, the accuracy of
+positioning by hand."""
 POSE, MOVED, WAITED = 1.0, 5.0, 3.0
-"""The cost of a pose; of one before which a channel is moved and settles,
-which takes minutes where a pose takes a part of one; and of one after a pause,
-which takes as long but no hands."""
+"""Costs: a pose; a pose after a change of a channel that has to settle, which takes
+minutes; a pose after a pause, which takes as long but no work."""
 FACES = 6
-"""Directions in which a moved channel, or a unit that rested, is asked about:
-what goes with them is a bias or a scale factor of an axis, and a face shows
-either best."""
+"""Directions for a changed channel or a rested unit: the effect is a bias or a scale
+factor of an axis, and a face shows either best."""
 BETWEEN = 24
-"""Directions farthest from all that were taken and from the cube's, on whose
-faces, vertices and edges an axis reads four values alone: two functions of that
-reading which agree there are distinguished between them."""
+"""Directions farthest from all that were taken and from those of the cube. On faces,
+edges and vertices an axis reads only four values; functions that agree there differ
+in between."""
 LONGER = 4.0
-"""Times as long a pose is to be held where each has an error of its own: half
-of what averages out is left."""
+"""Factor on the duration of the poses where each has an error of its own: it halves
+the part that averages out."""
 
 
 class ActionKind(StrEnum):
@@ -198,20 +193,19 @@ class ActionKind(StrEnum):
     PAUSE = "pause"
     """The unit rests before the pose."""
     LOG = "log"
-    """What goes with time goes with something that is not logged: log it."""
+    """An unmodelled drift may follow a channel that is not logged: log it."""
     HOLD = "hold"
     """Each pose has an error of its own: hold all of them longer."""
 
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """``up`` (3,) is the direction of up in the unit's frame, with the
-    ``label`` that a plan has for it. ``repeat_of`` is the pose, among all that
-    were given, whose direction it is. ``channel`` is moved ``by`` so much, in
-    its unit, or is to be logged; empty where nobody knows which. The pose
-    begins ``pause_s`` later than it would, or is held for ``hold_s``.
-    ``information`` is what it is expected to bring, in nats, beside the actions
-    before it."""
+    """``up`` (3,) is the direction of up in the unit's frame, with its ``label`` in a
+    plan. ``repeat_of`` is the index of a given pose with the same direction.
+    ``channel`` is changed ``by`` so much, in its unit, or is to be logged; empty
+    where unknown. The pose begins ``pause_s`` later than otherwise, or lasts
+    ``hold_s``. ``information`` is the expected gain in nats, given the previous
+    actions."""
 
     kind: ActionKind
     up: Floats | None = None
@@ -229,16 +223,16 @@ class Action:
 
 
 class Options:
-    """After the poses of a posterior and those that were chosen: the actions,
-    each with the pose that it gives, held as long and as quietly as is usual
-    here. Covariates stay as they last were, and the pose before is the last
-    one."""
+    """The possible actions after the poses of a posterior and those chosen so far,
+    each with its pose, of typical duration and noise. Covariates keep their last
+    values; the previous pose is the last one."""
 
     def __init__(self, posterior: Posterior, wanted: Sequence[int]) -> None:
-        """``wanted`` are poses that are to be taken again in any case, even if
-        the unit has to leave one for that."""
+        """``wanted`` are poses to be repeated in any case, even if the unit has to
+        leave one for that."""
         self.rows = posterior.evidence.rows
         self.wanted = {int(self.rows.places[i]) for i in wanted}
+        # Typical pose: median error, duration and gap.
         poses = self.rows.poses
         self.sensor = self.rows.state.sensor(self.rows.problem)
         self.usual = poses[int(np.argsort(self.rows.error[: self.rows.n], kind="stable")[self.rows.n // 2])]
@@ -262,8 +256,8 @@ class Options:
         ]
 
     def after(self, chosen: Sequence[Pose]) -> list[tuple[Action, Pose]]:
-        """Those in another direction than the last: a unit that stays where it
-        is makes no pose of its own."""
+        """Actions in another direction than the last pose: a unit that does not move
+        gives no new pose."""
         last = chosen[-1] if chosen else self.last
         here = reading_geometry(self.rows, last.mean[None]).up[0]
         return [
@@ -273,6 +267,8 @@ class Options:
         ]
 
     def _after(self, last: Pose) -> Iterator[tuple[Action, Pose]]:
+        # Plain poses and repetitions; then faces after a pause, or with a changed
+        # channel.
         next_s = last.end_s + self.gap_s
         for label, up, again in self.directions:
             yield (
@@ -310,26 +306,26 @@ class Options:
         )
 
     def _again(self, up: Floats) -> int | None:
-        """The pose of the same direction, among all that were given."""
+        """Index, among all given, of the pose with the same direction."""
         near = self._near(up, range(len(self.taken)))
         return int(self.rows.places[near[0]]) if near else None
 
     def _near(self, up: Floats, among: Sequence[int]) -> list[int]:
-        """Those of the poses that have this direction, the nearest first."""
+        """Indices of the poses with this direction, the nearest first."""
         along = self.taken @ up
         same = [i for i in among if along[i] > SAME]
         return sorted(same, key=lambda i: -along[i])
 
 
 def _label(up: Floats) -> str:
-    """That of the cube's direction, where it is one."""
+    """The label of the cube's direction, where it is one."""
     return next((label for label, v in cube_directions() if float(v @ up) > SAME), "")
 
 
 def _suspects(posterior: Posterior) -> list[int]:
-    """Poses that may be outliers, and then those that are far off the linear
-    fit."""
+    """Possible outliers, and poses far off the linear fit."""
     rows, outlier = posterior.evidence.rows, posterior.outlier_probabilities
+    # Studentized residuals of the linear fit.
     spread = np.sqrt(np.maximum(1 - np.sum(rows.basis**2, axis=1), 0.0))
     off = np.abs(rows.left / np.maximum(spread, 1e-9))[: rows.n]
     found = [i for i in range(rows.n) if outlier[i] >= UNDECIDED_PROBABILITY or off[i] >= FAR]
@@ -337,7 +333,7 @@ def _suspects(posterior: Posterior) -> list[int]:
 
 
 def _channels(posterior: Posterior) -> list[str]:
-    """Logged ones with which an effect goes that may act."""
+    """Logged channels on which a possible effect depends."""
     effects = {t.name: t.effect for t in posterior.evidence.terms if t.effect is not None}
     likely = [effects[name] for name, p in posterior.effect_probabilities.items() if p >= UNDECIDED_PROBABILITY]
     needed = (need for effect in likely for need in effect.needs if not is_derived(need))
@@ -348,34 +344,33 @@ def _range(poses: Sequence[Pose], channel: str) -> float:
     return float(np.ptp([p.channels[channel] for p in poses]))
 
 
-# Which poses next: those with the largest expected information on what acts
+# Selection of the poses with the largest expected information on the hypotheses
 # (Lindley 1956, Ann. Math. Stat. 27:986).
 
 SHARE = 0.99
-"""Of the probability that the sets hold which are asked, if so few do
-(`evidence.mixture_components.CELLS`)."""
+"""Share of the probability in the predictive cells, if few enough hold it
+(`mixture.CELLS`)."""
 DRAWS = 256
-"""Of what the poses may show: an expected entropy is then known to a few
+"""Number of draws of the outcomes: the expected entropy is then known to a few
 hundredths."""
 LEAST = 0.05
-"""Nats for the cost of a pose: what takes two hypotheses from even odds to two
-to one. Less is not worth a pose."""
+"""Nats per cost of a pose, the change from even odds to two to one; less is not worth
+a pose."""
 MOST = 6
-"""Poses at a time: what they show then tells so much that the draws are too few
-for one more."""
+"""Number of poses in one plan: their outcome is so informative that the draws are too
+few for more."""
 AT_ONCE = 16
-"""Poses that are predicted together: what each cell says of all of them is a
-matrix of all their rows."""
+"""Number of poses predicted at once: each cell has a covariance matrix of all their
+rows."""
 ALIKE = 0.02
-"""Actions that bring as much but for this share are alike, and the first of
-them is chosen: so much is the chance of the draws, and no processor's rounding
-decides."""
+"""Relative difference below which actions are equally good and the first is chosen,
+as large as the sampling error of the draws: rounding decides nothing."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """The probability of a name ``now``, and the mean of what it will be after
-    the actions ``if_it_acts``."""
+    """The probability of a name ``now``, and its mean after the actions
+    ``if_it_acts``."""
 
     now: float
     if_it_acts: float
@@ -383,9 +378,9 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """``actions`` in the order to take them. ``entropy`` is that of the
-    hypotheses, in nats, and ``entropy_after`` its mean after the actions;
-    ``expected`` has the names that are open, the likeliest first."""
+    """``actions`` in order. ``entropy`` is that of the hypotheses in nats,
+    ``entropy_after`` its mean after the actions; ``expected`` has the undecided
+    names, the likeliest first."""
 
     actions: tuple[Action, ...]
     entropy: float
@@ -394,12 +389,13 @@ class Advice:
 
 
 def advice(posterior: Posterior, most: int = 3) -> Advice:
-    """Up to so many poses, at best `MOST`, beside what to log and how long to
-    hold them. Raises Refused where the model does not hold in poses to come."""
+    """Up to ``most`` poses (at most `MOST`), and further actions: channels to log,
+    longer poses. Raises Refused where the model does not hold in poses to come."""
     if decided(posterior):
         return Advice((), 0.0, 0.0, {})
     most = min(most, MOST)
     future = _PredictiveDraws(Predictive.likeliest(posterior, SHARE))
+    # Repeat influential poses first, then select greedily.
     wanted = _influential_poses(posterior)[:most]
     options = Options(posterior, wanted)
     for pose in wanted:
@@ -412,11 +408,12 @@ def advice(posterior: Posterior, most: int = 3) -> Advice:
         if UNDECIDED_PROBABILITY < p < 1 - UNDECIDED_PROBABILITY
     }
     expected = {name: Expected(p, future.if_it_acts(name, p)) for name, p in names.items()}
-    return Advice((*_beside_poses(posterior), *future.actions), future.entropy, future.entropy_after, expected)
+    return Advice((*_other_actions(posterior), *future.actions), future.entropy, future.entropy_after, expected)
 
 
 def decided(posterior: Posterior) -> bool:
-    """Whether it is likelier than not that nothing acts but what is certain."""
+    """Whether the hypothesis of all certain effects and outliers, and nothing else,
+    has a probability above one half."""
     certain = posterior.evidence.odds.certain
     names = frozenset(name for group in posterior.certain if len(group) == 1 for name in group)
     outliers = frozenset(i for i, p in enumerate(posterior.outlier_probabilities) if reaches(p, certain))
@@ -425,8 +422,8 @@ def decided(posterior: Posterior) -> bool:
 
 
 def _influential_poses(posterior: Posterior) -> list[int]:
-    """Poses without which a name that is certain would not be: to be taken
-    again, whatever the posterior expects."""
+    """Poses without which a certain name would not be certain: to be repeated in any
+    case."""
     certain = posterior.evidence.odds.certain
     out = []
     for name, p in posterior.effect_probabilities.items():
@@ -436,9 +433,8 @@ def _influential_poses(posterior: Posterior) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _beside_poses(posterior: Posterior) -> Iterator[Action]:
-    """What no pose tells: a channel that nobody logs, and an error that every
-    pose has of its own."""
+def _other_actions(posterior: Posterior) -> Iterator[Action]:
+    """Actions that are no poses: logging of a channel, and longer poses."""
     if not reaches(posterior.unmodelled_probability, posterior.evidence.odds.reported):
         return
     what = next(what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE)
@@ -451,12 +447,12 @@ def _beside_poses(posterior: Posterior) -> Iterator[Action]:
 
 
 class _PredictiveDraws:
-    """Draws of what the actions taken so far will show: of draw s the rows
-    ``shown`` (S,K), those of one pose side by side, under the cell ``truth``
-    (S,)."""
+    """Draws of the outcomes of the chosen actions: ``shown`` (S,K) rows of draw s,
+    those of one pose side by side, under the cell ``truth`` (S,)."""
 
     def __init__(self, cells: Predictive) -> None:
         self.cells = cells
+        # Stratified draws of the true cell, in order of the hypotheses.
         order = np.argsort(cells.of, kind="stable")
         ends = np.cumsum(cells.weight[order])
         self.truth: Ints = order[np.minimum(np.searchsorted(ends, (np.arange(DRAWS) + 0.5) / DRAWS), len(ends) - 1)]
@@ -470,8 +466,8 @@ class _PredictiveDraws:
         self.entropy = self.entropy_after = self._entropy_of(self.weight)
 
     def take(self, options: Options, again: int | None = None) -> bool:
-        """The best action of all, if it is worth its cost; or the best that
-        takes a pose ``repeat_of``, whatever that is worth."""
+        """Take the best action, if it is worth its cost; or the best repetition of
+        the pose ``again``, whatever its worth."""
         found, gain = options.after(self.poses), list[float]()
         normal = self.rng.standard_normal((DRAWS, 2 if options.rows.slopes else 1))
 
@@ -479,11 +475,13 @@ class _PredictiveDraws:
             rows = options.rows.of_future_poses([*self.poses, *(pose for _, pose in of)])
             return _CellPredictions(self, rows, normal)
 
+        # Expected information of every candidate: entropy now less mean entropy after.
         for first in range(0, len(found), AT_ONCE):
             some = predictions(found[first : first + AT_ONCE])
             for i in range(len(self.poses), some.rows.n):
                 weight = some.weight(i, some.shown_with(i))
                 gain.append(self.entropy_after - self._entropy_of(weight))
+        # Information per cost; ties go to the first.
         rate = np.array(gain) / [action.cost for action, _ in found]
         if again is not None:
             rate[[action.kind is not ActionKind.REPEAT or action.repeat_of != again for action, _ in found]] = -np.inf
@@ -500,8 +498,8 @@ class _PredictiveDraws:
         return True
 
     def if_it_acts(self, name: str, p: float) -> float:
-        """The mean of p′² over that of p′, where p′ is the probability after
-        the actions: draws in which the name acts are as frequent as p′ says."""
+        """E[p′²] / E[p′] for the probability p′ after the actions: the mean of p′
+        over draws in which the name acts, which are as frequent as p′ states."""
         after = self.cells.with_name(name) @ self.weight
         return float(np.mean(after**2) / np.mean(after)) if after.any() else p
 
@@ -510,49 +508,51 @@ class _PredictiveDraws:
 
 
 class _CellPredictions:
-    """Of the poses of ``rows``, those taken first, what every cell says beside
-    what was shown; ``normal`` (S,r) are the draws, the same for all."""
+    """Predictions of every cell for the poses of ``rows``, the chosen ones first,
+    conditional on ``shown``; ``normal`` (S,r) are standard normal draws, common to
+    all."""
 
     def __init__(self, future: _PredictiveDraws, rows: LinearisedData, normal: Floats) -> None:
         self.future, self.rows, self.normal = future, rows, normal
         self.mean, self.covariance = future.cells.predicted(rows)
         self.noise = np.concatenate([cells.noise for cells in future.cells.mixture])
         self.taken = self._places(range(len(future.poses)))
+        # Regression of the candidate rows on the rows shown: Σ₁₁⁻¹ Σ₁₂.
         inner = self.covariance[:, self.taken[:, None], self.taken]
         self.gain = np.linalg.solve(inner, self.covariance[:, self.taken])
         self.off = future.shown - self.mean[future.truth[:, None], self.taken]
 
     def _places(self, poses: Iterable[int]) -> Ints:
-        """Of the rows of poses."""
+        """Indices of the rows of poses."""
         index = np.array(list(poses), dtype=int)[:, None]
         return np.ravel([index, index + self.rows.n] if self.rows.slopes else index, order="F")
 
     def _principal(self, covariance: Floats) -> tuple[Floats, Floats]:
-        """Variances (C,k) and axes (C,k,k) of covariances (C,k,k) of rows to
-        come. None is less than the noise, whatever rounding leaves of it beside
-        what is hardly known."""
+        """Variances (C,k) and axes (C,k,k) of predictive covariances (C,k,k); no
+        variance is below the noise, whatever rounding leaves."""
         size, axes = np.linalg.eigh(covariance)
         return np.maximum(size, self.noise[:, None]), axes
 
     def shown_with(self, pose: int) -> Floats:
-        """(S,K) what was shown and what this pose shows, by the cell that is
-        true in each draw."""
+        """(S,K) the rows shown so far and those of this pose, drawn from the true
+        cell."""
         at, truth = self._places([pose]), self.future.truth
         gain = self.gain[:, :, at]
         crossed = self.covariance[:, at[:, None], self.taken]
         own = self.covariance[:, at[:, None], at]
+        # Conditional covariance and mean of the new rows, then a normal draw.
         lower = _lower(*self._principal(own - crossed @ gain))[truth]
         mean = self.mean[truth[:, None], at] + np.einsum("sk,skr->sr", self.off, gain[truth])
         return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", lower, self.normal)], axis=1)
 
     def weight(self, pose: int, shown: Floats) -> Floats:
-        """(C,S) of the cells after this pose too: by products of the precision
-        of each cell with the squares of what is shown, one product of matrices
-        for all draws."""
+        """(C,S) weights of the cells after this pose: Bayes' rule with normal
+        likelihoods, as one matrix product for all draws."""
         at = np.concatenate([self.taken, self._places([pose])])
         own = self.covariance[:, at[:, None], at]
         size, axes = self._principal(own)
         mean, precision = self.mean[:, at], (axes / size[:, None]) @ axes.transpose(0, 2, 1)
+        # −½ (y − μ)ᵀ P (y − μ) − ½ ln|Σ|, expanded in products y yᵀ and y.
         scored = np.einsum("cij,cj->ci", precision, mean)
         pairs = (shown[:, :, None] * shown[:, None]).reshape(len(shown), -1)
         squares = precision.reshape(len(mean), -1) @ pairs.T - 2 * scored @ shown.T
@@ -563,13 +563,13 @@ class _CellPredictions:
 
 
 def _lower(size: Floats, axes: Floats) -> Floats:
-    """(C,k,k) the Cholesky factors of covariances with these variances and axes,
-    however different the variances are."""
+    """(C,k,k) Cholesky factors of covariances with these variances and axes, by QR,
+    accurate for variances of any ratio."""
     upper: Floats = np.asarray(np.linalg.qr((axes * np.sqrt(size)[:, None]).transpose(0, 2, 1), mode="r"))
     sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
     return np.asarray((upper * sign[:, :, None]).transpose(0, 2, 1))
 
 
 def _entropy(p: Floats) -> Floats:
-    """(…) of probabilities (H,…), in nats."""
+    """(…) entropy of probabilities (H,…), in nats."""
     return np.asarray(-np.sum(p * np.log(np.maximum(p, 1e-300)), axis=0))

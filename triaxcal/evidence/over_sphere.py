@@ -1,8 +1,8 @@
-"""What all likely sets say of |a| over the sphere in the next recording: its
-mean, its spread, and how far a reported sensor is expected to be off.
+"""The posterior of |a| over the sphere in the next recording: mean, spread, and the
+expected error of a reported sensor.
 
-The posterior decides by this what is corrected. What the covariance of the
-reported parameters does not hold is stated beside them.
+The selection of the correction uses the expected error. The part that the covariance
+of the reported parameters does not contain is stated separately.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import SMOOTH, Empirical
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.evidence.mixture import Components, NextReadings
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.terms import Term
@@ -24,28 +24,28 @@ from triaxcal.model.directions import spiral
 from triaxcal.model.sensor import LINEAR
 
 SPHERE = 150
-"""Directions: more than a function of direction has free values up to the
-degree that is corrected (`effects.empirical.DEGREES`)."""
+"""Number of directions: more than the free values of a function of direction up to
+the degree that is corrected (`effects.empirical.DEGREES`)."""
 OF_DIRECTION = (UnmodelledKind.DIRECTION, UnmodelledKind.ODD, UnmodelledKind.EVEN, UnmodelledKind.LOCAL)
 DRAWN_ANEW = (UnmodelledKind.EACH_POSE, UnmodelledKind.POSE_BEFORE)
 ROUGHER = 4.0
 """Factor on the variance between poses. Steps and bends vary more there than the
 assumed smooth covariance allows."""
 NOWHERE = 1e3
-"""References: so far from every pose that none is near, though it is a number."""
+"""In units of the reference: a previous pose so far from every other that no
+correlation is left."""
 ACROSS = 4.0
-"""Variance of a component across the measured vector over that of |a|, less
-what the nine parameters take of both. Of forms of the second to the fifth
-degree in the force, drawn at random, it is 3.0, 7.4, 2.5 and 4.6."""
+"""Ratio of the variance of a component across the measured vector to that of |a|,
+both after projection off the nine parameters. For random forms of the second to the
+fifth degree in the force it is 3.0, 7.4, 2.5 and 4.6."""
 
 
 @dataclass(frozen=True, eq=False)
 class _OfPart:
-    """One unmodelled part, seen from M readings over the sphere: ``to`` (M,N)
-    predicts it linearly from the rows, and ``error`` (M,) is the variance of
-    that prediction. ``of_smooth`` (h,h) is the covariance that remains in the
-    smooth coefficients, ``prior`` (h,) their variance before the poses were
-    seen. All are in units of the noise variance. ``smooth`` is true for a
+    """Prediction of one unmodelled part in M readings over the sphere, in units of
+    the noise variance: ``to`` (M,N) is the linear prediction from the rows, ``error``
+    (M,) its variance. ``of_smooth`` (h,h) is the remaining covariance of the smooth
+    coefficients, ``prior`` (h,) their prior variance. ``smooth`` is true for a
     function of direction."""
 
     to: Floats
@@ -57,8 +57,8 @@ class _OfPart:
 
 @dataclass(frozen=True, eq=False)
 class _OfKind:
-    """Of an unmodelled covariance of size one: of M readings with the rows
-    (M,N), their variances (M,), and the covariance (h,h) of the coefficients of
+    """An unmodelled covariance of size one: covariance of M readings with the rows
+    (M,N), variances of the readings (M,), and covariance (h,h) of the coefficients of
     a smooth term."""
 
     crossed: Floats
@@ -68,10 +68,10 @@ class _OfKind:
 
 @dataclass(frozen=True, eq=False)
 class Smooth:
-    """The h coefficients of a smooth term, of some cells: ``by_parameters``
-    (h,d) of theirs, ``constant`` (h,), the covariance ``error`` (h,h) of what
-    no parameter describes, but for the noise; and the variance (h,) ``prior``
-    to the poses."""
+    """The h coefficients of a smooth term in some cells, as a linear function of the
+    cells' parameters: ``by_parameters`` (h,d) and ``constant`` (h,). ``error`` (h,h)
+    is the covariance that no parameter describes, without the noise; ``prior`` (h,)
+    the prior variance."""
 
     by_parameters: Floats
     constant: Floats
@@ -81,10 +81,10 @@ class Smooth:
 
 @dataclass(frozen=True, eq=False)
 class OverSphere:
-    """Of M readings all over the sphere, over the error of a pose: the ``mean``
-    (M,) of |a| and the mean of its ``square`` (M,), counted from the point of
-    linearisation. ``across`` is the mean square of what a component across the
-    measured vector may be off, beside all parameters."""
+    """M readings over the sphere, in units of the error of a pose: ``mean`` (M,) and
+    mean ``square`` (M,) of |a| relative to the point of linearisation. ``across`` is
+    the mean square error of a component across the measured vector that no parameter
+    describes."""
 
     there: NextReadings
     columns: Floats
@@ -93,26 +93,31 @@ class OverSphere:
     across: float
     smooth: Empirical
     harmonics: Floats
-    """(h,M): the coefficients of the ``smooth`` term that come, beside the nine
-    parameters, nearest to a function of the readings."""
+    """(h,M): least-squares coefficients of the ``smooth`` term, fitted to a function
+    of the readings together with the nine parameters."""
     here: PoseInputs
     of_kind: dict[UnmodelledCovariance, _OfKind]
     of_part: dict[int, _OfPart]
-    """Those that were asked for."""
+    """Cached parts."""
 
     @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, mixture: Sequence[Components]) -> OverSphere:
+    def of(cls, posterior: Posterior, at: ReferenceEpoch, mixture: Sequence[Components]) -> OverSphere:
         there = NextReadings.of(posterior, at, spiral(SPHERE))
         columns = _columns(posterior, mixture, there)
         smooth = Empirical(SMOOTH)
+        # Coefficients of the smooth term: rows of the pseudo-inverse of [linear,
+        # smooth].
         basis = np.concatenate([there.linear, there.by_coefficients(smooth)], axis=1)
         size = np.linalg.norm(basis, axis=0)
         harmonics = (np.linalg.pinv(basis / size) / size[:, None])[LINEAR:]
         here, nothing = PoseInputs.of(posterior.evidence.rows), np.zeros(SPHERE)
         bare = cls(there, columns, nothing, nothing, 0.0, smooth, harmonics, here, {}, {})
         mean, square, across, total = np.zeros(SPHERE), np.zeros(SPHERE), 0.0, 0.0
+        # Law of total variance over the cells: E[f] and E[f²] of |a| in each reading.
         for cells in mixture:
             part = bare._part(posterior, cells, at)
+            # f = J q + T y: parameters, and the prediction of the unmodelled part from
+            # residuals.
             J = bare._design(cells) - part.to @ cells.design
             of_cells = part.to @ posterior.evidence.rows.y + cells.conditional_mean @ J.T
             within = np.einsum("md,kde,me->km", J, cells.conditional_covariance, J, optimize=True)
@@ -123,24 +128,26 @@ class OverSphere:
         return replace(bare, mean=mean / total, square=square / total, across=across / total)
 
     def loss(self, reported: Floats) -> float:
-        """The expected mean square of |a| over the sphere, over the error of a
-        pose, where ``reported`` (M,) is taken off."""
+        """Expected mean square error of |a| over the sphere, in units of the error of
+        a pose, after subtraction of ``reported`` (M,)."""
         return float(np.mean(self.square - 2 * self.mean * reported + reported**2))
 
     def by_parameters(self, posterior: Posterior, effects: Sequence[Effect]) -> Floats:
-        """(M,9+p) of the linear parameters as the fit has them, and of the
-        coefficients of these effects."""
+        """(M,9+p) derivatives of |a| by the linear parameters in the scale of the
+        fit, and by the coefficients of these effects."""
         own = [self.there.by_coefficients(effect) for effect in effects]
         return np.concatenate([self.there.linear * posterior.evidence.rows.lengths, *own], axis=1)
 
-    def _part(self, posterior: Posterior, cells: Components, at: HoldsAt) -> _OfPart:
-        """The next recording draws anew what each pose had of its own, and what
-        came from the pose before."""
+    def _part(self, posterior: Posterior, cells: Components, at: ReferenceEpoch) -> _OfPart:
+        """Prediction of the part in the next recording. Contributions of single poses
+        and of the previous pose are independent there."""
         if cells.part in self.of_part:
             return self.of_part[cells.part]
         (M, N), h = (len(self.there.linear), len(posterior.evidence.rows.y)), len(self.harmonics)
         part, rows = posterior.evidence.parts[cells.part], posterior.evidence.rows
         found = _OfPart(np.zeros((M, N)), np.zeros(M), np.zeros((h, h)), np.zeros(h))
+        # Kriging of a function of direction: T = K(next, rows) P, error variance K − T
+        # K(rows, next).
         if part.kind is not None and part.kind.what in OF_DIRECTION:
             kind, variance, P = self._kind(part.kind), part.tau**2, self.harmonics
             crossed = variance * kind.crossed
@@ -148,6 +155,7 @@ class OverSphere:
             error = ROUGHER * (variance * kind.own - np.sum(to * crossed, axis=1))
             of_smooth = ROUGHER * (variance * kind.of_smooth - (P @ to) @ (P @ crossed).T)
             found = _OfPart(to, error, of_smooth, variance * np.diag(kind.of_smooth), smooth=True)
+        # A bias that wanders in time: its prediction at the reference epoch.
         elif part.kind is not None and part.kind.what is UnmodelledKind.TIME:
             by_bias = self.there.geometry.by_bias / self.there.error
             crossed = part.tau**2 * by_bias @ part.kind.bias_at(rows, at.t_s)
@@ -160,7 +168,8 @@ class OverSphere:
         return found
 
     def _kind(self, kind: UnmodelledCovariance) -> _OfKind:
-        """The readings as poses that follow no known one."""
+        """Covariances for readings as poses of a new recording, far from every
+        previous pose."""
         if kind not in self.of_kind:
             M, P = len(self.there.linear), self.harmonics
             zero, run, error = np.zeros(M), np.full(M, -1), np.full(M, self.there.error)
@@ -170,9 +179,10 @@ class OverSphere:
         return self.of_kind[kind]
 
     def of_cells(self, posterior: Posterior, cells: Components, listed: Floats, to: Floats) -> Smooth:
-        """The ``smooth`` term of some cells: what |a| is off beside the
-        ``listed`` parameters (M,9+p), which are ``to`` (9+p,d) of those of the
-        cells. A process in time is no function of direction: the bias has it."""
+        """Posterior of the ``smooth`` term in some cells: the part of |a| that the
+        ``listed`` parameters (M,9+p), which are ``to`` (9+p,d) times those of the
+        cells, leave. A process in time is no function of direction and belongs to the
+        bias."""
         part, P = self.of_part[cells.part], self.harmonics
         by_parameters = self._design(cells) - listed @ to
         if not part.smooth:
@@ -182,16 +192,18 @@ class OverSphere:
         return Smooth(P @ by_parameters - onto @ cells.design, constant, part.of_smooth, part.prior)
 
     def _across(self, posterior: Posterior, cells: Components, part: _OfPart) -> Floats:
-        """(k,) mean square of a component across the measured vector, of what
-        acts along it as a function of the force: all of it where no name
-        describes it, some where a name may be another's."""
+        """(k,) mean square of a component across the measured vector, due to
+        functions of the force: all of the unmodelled part, and the share
+        ``Odds.another_form`` of named effects, which may have another form."""
         evidence, out = posterior.evidence, np.zeros(len(cells.share))
         kind = evidence.parts[cells.part].kind
+        # Unmodelled function of direction: residual prediction and its variance.
         if part.smooth:
             unmodelled = cells.residuals @ part.to.T
             out += ACROSS * np.mean(unmodelled**2 + cells.noise[:, None] * part.error, axis=1)
         elif kind is not None and kind.what in DRAWN_ANEW:
             out += cells.noise * float(np.mean(part.error))
+        # Named effects of the force alone, after projection off the nine parameters.
         of_force = [_of_force_alone(evidence.terms[i]) for i in cells.found.members]
         if any(of_force):
             ranks = [evidence.terms[i].rank for i in cells.found.members]
@@ -214,8 +226,8 @@ def _of_force_alone(term: Term) -> bool:
 
 
 def _columns(posterior: Posterior, mixture: Sequence[Components], there: NextReadings) -> Floats:
-    """(M,C) of all terms; zero of those that are in no likely set, and of
-    outliers."""
+    """(M,C) derivatives of |a| in the readings by all terms; zero for terms of no
+    likely set and for outliers."""
     evidence = posterior.evidence
     out = np.zeros((len(there.linear), evidence.columns.count))
     known: dict[int, Floats] = {}

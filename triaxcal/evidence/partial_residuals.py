@@ -1,9 +1,9 @@
-"""Partial residuals: what the poses show of one effect alone, against the
-variable that drives it (Larsen and McCleary 1972, Technometrics 14:781).
+"""Partial residuals of one effect against the variable that drives it (Larsen and
+McCleary 1972, Technometrics 14:781).
 
-A partial residual is the residual of the full model plus the contribution of
-one effect. The nine linear parameters absorb a part of every effect, so that
-the contribution is what they leave of it in the poses that the fit uses.
+A partial residual is the residual of the full model plus the contribution of one
+effect. The nine linear parameters absorb a part of every effect; the contribution is
+the remainder in the poses that the fit uses.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ PREDICTED = "predicted"
 """The contribution to |a| by the fit, in units of the reference: the variable
 of an effect that no single one drives."""
 POSE = "pose"
-"""The number of the pose, from 1, where nobody knows the times."""
+"""The number of the pose, from 1, where the times are not known."""
 LEVEL = 0.95
-"""Of the band about a curve."""
+"""Confidence level of the band about a curve."""
 POINTS = 41
-"""Of a curve: more than a picture of some 300 pixels shows as straight lines."""
+"""Points of a curve: a picture of some 300 pixels needs no more."""
 PANELS = 3
-"""Of an effect with more parts those are shown that contribute most (rms in
-standard errors); of what has no name the three most telling variables."""
+"""Number of panels: parts of an effect with the largest contributions (rms in
+standard errors), or the three most telling variables of an unexplained residual."""
 VISIBLE = 0.45
-"""The least share with which |a| follows an axis, for a pose to be shown: below
-it the error bar is more than twice that of |a|. It is less than the 0.5 of the
-edges of a cube, which rounding must not decide."""
+"""Least derivative of |a| by the reading of an axis for a pose in the picture: below
+it the error bar is more than twice that of |a|. It is less than the 0.5 of the edges
+of a cube, so rounding decides nothing."""
 SAME = 1e-6
-"""Relative difference below which two functions are one: they differ by
-rounding, or by far more."""
+"""Relative difference below which two functions are the same: others differ by far
+more."""
 OF_READING, OF_COVARIATE = (3, 4, 5), (1, 2)
 """Degrees of the polynomials of `telling_variables`."""
 AXES = 3
@@ -71,7 +71,7 @@ AXES = 3
 
 
 class Quantity(StrEnum):
-    """What a partial residual is of."""
+    """The quantity of a partial residual."""
 
     MAGNITUDE = "magnitude"
     """|a|."""
@@ -86,19 +86,18 @@ class Quantity(StrEnum):
 class Trace:
     """k partial residuals against one variable, and the fitted curve.
 
-    ``effect`` is empty where no effect is meant; ``axis`` ("x", "y", "z") the
-    one on which its ``coefficients`` act, empty where that is not one.
-    ``variable`` is a covariate by its name (`triaxcal.effects.contract`), one
-    of `READINGS`, `PREDICTED` or `POSE`; `unit_of` has its unit. ``pose`` (k,)
-    are the places among all poses that were given; ``x`` (k,) the variable;
-    ``y`` (k,) the partial residuals and ``error`` (k,) one standard error of
-    the pose, in units of the reference unless the ``quantity`` says otherwise;
-    ``excluded`` (k,) the poses that the fit does not use. ``curve`` (m,) is the
-    contribution at the values ``grid`` (m,) of the variable, and
-    ``half_width`` (m,) that of its 95 % band; none where there is no curve.
-    ``share`` is how telling the variable of an unexplained residual is, and
-    ``p_value`` how often chance makes any variable as telling
-    (`telling_variables`); else None.
+    ``effect`` is empty for a residual without one; ``axis`` ("x", "y", "z") is the
+    one on which its ``coefficients`` act, empty where there are several. ``variable``
+    is a covariate by name (`triaxcal.effects.contract`), one of `READINGS`,
+    `PREDICTED` or `POSE`; `unit_of` has its unit. ``pose`` (k,) are indices among all
+    given poses; ``x`` (k,) the variable; ``y`` (k,) the partial residuals and
+    ``error`` (k,) one standard error of the pose, in units of the reference unless
+    the ``quantity`` says otherwise; ``excluded`` (k,) the poses that the fit does not
+    use. ``curve`` (m,) is the contribution at the values ``grid`` (m,) of the
+    variable, ``half_width`` (m,) half its 95 % band; empty without a curve. ``share``
+    measures how telling the variable of an unexplained residual is, ``p_value`` is
+    the probability of as telling a variable by chance (`telling_variables`); else
+    None.
     """
 
     effect: str
@@ -119,9 +118,9 @@ class Trace:
 
 
 def of_effect(rows: LinearisedData, c: Calibration, name: str) -> tuple[Trace, ...]:
-    """Of the effect of that name in the model ``c``, which was fitted to these
-    ``rows``: a trace for each axis on which it acts, `PANELS` at most. Raises
-    KeyError where the model has no such effect."""
+    """Traces of an effect of the model ``c``, fitted to these ``rows``: one for each
+    axis on which it acts, at most `PANELS`. Raises KeyError where the model has no
+    such effect."""
     data = _Data.of(rows, c)
     at = LINEAR
     for effect, q in c.sensor.effects:
@@ -133,15 +132,15 @@ def of_effect(rows: LinearisedData, c: Calibration, name: str) -> tuple[Trace, .
 
 
 def telling_variables(rows: LinearisedData, c: Calibration, of_direction: bool = False) -> tuple[Trace, ...]:
-    """What the model ``c`` leaves, against the `PANELS` variables that tell most
-    of it; ``of_direction``: the readings of the axes before any other.
+    """The residuals of the model ``c`` against the `PANELS` most telling variables;
+    ``of_direction``: readings of the axes first.
 
-    The measure is the adjusted share of the weighted sum of squares that a
-    smooth curve in the variable takes away beside the nine parameters: 1 less
-    the ratio of the mean squares with and without it. The curve is a polynomial
-    of degree 5 in the reading of an axis, whose first three terms the nine
-    absorb, and of degree 2 on each axis in any other variable. The probability
-    is that of the F test, times the number of variables (Bonferroni).
+    The measure is the adjusted share of the weighted sum of squares that a smooth
+    curve in the variable explains in addition to the nine parameters: 1 less the
+    ratio of the mean squares with and without it. The curve is a polynomial of degree
+    5 in the reading of an axis, whose first three terms the nine absorb, and of
+    degree 2 on each axis in any other variable. The probability is that of the F
+    test, times the number of variables (Bonferroni).
     """
     data = _Data.of(rows, c).of_means()
     found = [fit for drivers in data.candidates() if drivers and (fit := data.fitted(drivers)) is not None]
@@ -150,9 +149,8 @@ def telling_variables(rows: LinearisedData, c: Calibration, of_direction: bool =
 
 
 def residuals(c: Calibration) -> Trace:
-    """Of all poses whose residual is known, in standard errors, against the
-    time; against the number of the pose where several recordings, or unknown
-    times, have none in common."""
+    """Residuals of all poses, where known, in standard errors, against the time;
+    against the number of the pose for several recordings or unknown times."""
     known = [i for i, p in enumerate(c.poses) if np.isfinite(p.residual_g) and p.standard_error_g > 0]
     poses = [c.poses[i] for i in known]
     t_s = np.array([p.pose.t_s for p in poses])
@@ -177,19 +175,20 @@ def residuals(c: Calibration) -> Trace:
 
 @dataclass(frozen=True, eq=False)
 class _Coefficients:
-    """``values`` (p,), their ``covariance`` (p,p), and the factor that makes a
-    standard error half a band."""
+    """``values`` (p,), their ``covariance`` (p,p), and the factor from a standard
+    error to half a band."""
 
     values: Floats
     covariance: Floats
     coverage: float
 
     def standard_error(self, by_one: Floats) -> Floats:
-        """(m,) of sums of them, by so much (m,p) of each."""
+        """(m,) standard errors of linear combinations with weights (m,p)."""
         return np.asarray(np.sqrt(np.maximum(np.einsum("mp,pq,mq->m", by_one, self.covariance, by_one), 0.0)))
 
     def only(self, index: Ints, given: Ints | None = None) -> _Coefficients:
-        """Some of them, as they are known if those ``given`` are as estimated."""
+        """Some of the coefficients, conditional on the estimates of those
+        ``given``."""
         covariance = self.covariance[np.ix_(index, index)]
         if given is not None and len(given):
             crossed, others = self.covariance[np.ix_(index, given)], self.covariance[np.ix_(given, given)]
@@ -200,12 +199,12 @@ class _Coefficients:
 @dataclass(frozen=True, eq=False)
 class _Driver:
     """Coefficients that act on |a| by ``loading`` (n,) times functions of one
-    variable ``x`` (n,). ``functions`` gives k values of them (k,p), and
-    ``absorbed`` those of the functions (k,h) of the same variable that the nine
-    parameters can take away from them. ``whole`` is true where the nine
-    parameters remove exactly the functions in ``absorbed``. Otherwise they may
-    also reduce the effect's own function, because the variable was correlated
-    with the directions. ``rows`` (n,) are the poses in which it acts."""
+    variable ``x`` (n,). ``functions`` gives k values of them (k,p), ``absorbed``
+    those of the functions (k,h) of the same variable that the nine parameters can
+    remove. ``whole``: the nine parameters remove exactly the functions in
+    ``absorbed``. Otherwise they may also reduce the effect's own function, because
+    the variable was correlated with the directions. ``rows`` (n,) are the poses in
+    which it acts."""
 
     variable: str
     quantity: Quantity
@@ -220,8 +219,8 @@ class _Driver:
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """A smooth curve in one variable: the ``coefficients`` of all ``drivers``,
-    as many of each. ``p_value`` is that of its F test."""
+    """A smooth curve in one variable: ``coefficients`` of all ``drivers``, equally
+    many each. ``p_value`` is that of its F test."""
 
     drivers: Sequence[_Driver]
     coefficients: _Coefficients
@@ -235,8 +234,8 @@ class _Curve:
 
 @dataclass(frozen=True, eq=False)
 class _Data:
-    """The poses of ``rows`` under the model ``c``; ``used`` (N,) are the rows of
-    those that the fit uses."""
+    """The poses of ``rows`` under the model ``c``; ``used`` (N,) are the rows that
+    the fit uses."""
 
     rows: LinearisedData
     c: Calibration
@@ -248,19 +247,19 @@ class _Data:
         return cls(rows, c, np.resize(used, len(rows.y)))
 
     def of_means(self) -> _Data:
-        """Without the slopes inside the poses."""
+        """The same without the slopes inside the poses."""
         return replace(self, used=self.used & (np.arange(len(self.used)) < self.rows.n))
 
     def left(self, columns: Floats) -> Floats:
-        """What the nine parameters, fitted to the poses used, leave of columns
-        (N,…) in the means (n,…)."""
+        """Residuals (n,…) of columns (N,…) in the means after regression on the nine
+        parameters in the used rows."""
         linear, n = self.rows.linear, self.rows.n
         found = np.linalg.lstsq(linear[self.used], columns[self.used], rcond=None)[0]
         return np.asarray(columns[:n] - linear[:n] @ found)
 
     @cached_property
     def residual(self) -> Floats:
-        """(n,) of |a|, under all effects of the model."""
+        """(n,) residuals of |a| under all effects of the model."""
         y = self.rows.y.copy()
         for effect, q in self.c.sensor.effects:
             y -= self.rows.by_coefficients(effect) @ q
@@ -268,12 +267,12 @@ class _Data:
 
     @property
     def error(self) -> Floats:
-        """(n,) by which the means were weighted."""
+        """(n,) standard errors that weighted the means."""
         return self.rows.error[: self.rows.n]
 
     @property
     def in_fit(self) -> Bools:
-        """(n,)"""
+        """(n,) whether the fit uses each pose."""
         return self.used[: self.rows.n]
 
     @cached_property
@@ -282,17 +281,18 @@ class _Data:
 
     @cached_property
     def s(self) -> Floats:
-        """(n,3) along the sensitive axes."""
+        """(n,3) readings along the sensitive axes."""
         problem = self.rows.problem
         return self.rows.point.sensor(problem).along_axes(problem.u, problem.covariates)
 
     @cached_property
     def by_axis(self) -> Floats:
-        """(n,3) how much |a| follows the reading of each axis."""
+        """(n,3) derivatives of |a| by the reading of each axis."""
         problem = self.rows.problem
         return self.rows.point.sensor(problem).radius(problem.u, problem.covariates).by_v
 
     def traces_of(self, effect: Effect, q: Floats, covariance: Floats, coverage: float) -> Iterator[Trace]:
+        # Contributions by part; the largest PANELS parts in their own order.
         contribution = self.contribution(self.rows.by_coefficients(effect))
         groups = _groups(effect)
         weight = [self.weight(contribution[:, index] @ q[index]) for index in groups]
@@ -306,19 +306,20 @@ class _Data:
                 yield replace(made, effect=effect.name, coefficients=names)
 
     def contribution(self, columns: Floats) -> Floats:
-        """(n,p) to |a| by one of each coefficient, after what the nine
-        parameters absorb, of ``columns`` (N,p) of the rows."""
+        """(n,p) contribution to |a| of a unit of each coefficient, after absorption
+        by the nine parameters, from ``columns`` (N,p) of the rows."""
         return -self.left(columns) * self.error[:, None]
 
     def weight(self, contribution: Floats) -> float:
-        """Its rms in standard errors."""
+        """Rms of a contribution in standard errors."""
         return float(np.sqrt(np.mean((contribution / self.error)[self.in_fit] ** 2)))
 
     def trace(self, driver: _Driver | None, contribution: Floats, of: _Coefficients, residual: Floats) -> Trace:
-        """``contribution`` (n,p) as above, ``residual`` (n,) that of the full
+        """The trace of ``contribution`` (n,p); ``residual`` (n,) is that of the full
         model."""
         if driver is None:
             return self._against_predicted(residual, contribution, of)
+        # Poses in which |a| follows the axis, and the curve over their range.
         shown = driver.rows & (np.abs(driver.loading) >= VISIBLE)
         grid = _grid(driver, driver.x[shown])
         curves = self._curves(driver, contribution)
@@ -341,15 +342,15 @@ class _Data:
 
     @cached_property
     def stated_error(self) -> Floats:
-        """(n,) standard errors of the poses as documents have them."""
+        """(n,) standard errors of the poses as in documents."""
         return np.array([self.c.poses[place].standard_error_g for place in self.rows.places])
 
     def _curves(self, driver: _Driver, contribution: Floats) -> Callable[[Floats], Floats]:
-        """What one of each coefficient contributes at values of the variable:
-        the functions themselves and those that the nine parameters can take
-        away, adjusted to the ``contribution`` (n,p) in the poses. A part of it
-        that went along with the directions is no function of the variable, and
-        is left out."""
+        """Contribution of a unit of each coefficient at values of the variable: the
+        functions themselves and those that the nine parameters can remove, fitted to
+        the ``contribution`` (n,p) in the poses. A part correlated with the directions
+        is no function of the variable and is omitted."""
+        # Weighted regression of the contribution on own and absorbed functions.
         rows = driver.rows & self.in_fit
         weight = (driver.loading / self.error)[rows, None]
         own, taken = driver.functions(driver.x[rows]) * weight, driver.absorbed(driver.x[rows]) * weight
@@ -361,10 +362,10 @@ class _Data:
         return lambda x: np.asarray(np.concatenate([driver.functions(x), driver.absorbed(x)], axis=1) @ found)
 
     def _against_predicted(self, residual: Floats, contribution: Floats, of: _Coefficients) -> Trace:
-        """Of an effect that no single variable drives: the curve is the straight
-        line on which both are equal. The variance of the contribution to the
-        poses, which makes the band, is fitted by a constant and a multiple of
-        its square."""
+        """The trace of an effect without a single driving variable, against its
+        predicted contribution: the curve is the identity. The variance of the
+        contribution, for the band, is fitted by a constant and a multiple of its
+        square."""
         predicted = contribution @ of.values
         grid = np.linspace(predicted.min(), predicted.max(), POINTS)
         size = max(float(np.abs(predicted).max()), 1e-300)
@@ -389,8 +390,8 @@ class _Data:
     # What drives an effect.
 
     def driver(self, effect: Effect, index: Ints) -> _Driver | None:
-        """None where no single variable drives these coefficients, or too few
-        poses show it."""
+        """The driver of these coefficients; None where no single variable drives
+        them, or too few poses show it."""
         try:
             basis = effect.basis(self.s, self.covariates)[:, :, index]
             return next((driver for driver in self._drivers(effect, index, basis) if self._shows(driver)), None)
@@ -402,7 +403,7 @@ class _Data:
         return len(x) > 1 and bool(np.ptp(x) > 0)
 
     def _drivers(self, effect: Effect, index: Ints, basis: Floats) -> Iterator[_Driver]:
-        """Those by which the ``basis`` (n,3,p) follows from one variable."""
+        """Drivers with which the ``basis`` (n,3,p) is a function of one variable."""
         axes = [i for i in range(AXES) if basis[:, i].any()]
         if not effect.needs:
             if len(axes) == 1:
@@ -412,7 +413,7 @@ class _Data:
             yield from self._by_covariate(effect, index, axes[0], basis[:, axes[0]])
 
     def _by_own_reading(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
-        """By that of the axis on which alone it acts."""
+        """Driver by the reading of the only axis on which the effect acts."""
         reference = self.rows.problem.reference
 
         def own(x: Floats) -> Floats:
@@ -422,9 +423,9 @@ class _Data:
             yield self.of_reading(axis, lambda x: own(x) * x[:, None] / reference)
 
     def _by_two_readings(self, effect: Effect, index: Ints, basis: Floats) -> Iterator[_Driver]:
-        """By the reading of one axis, times the square of that of another:
-        what changes the scale factor of the one by the reading of the other, on
-        whichever of the two it acts."""
+        """Driver by the reading of one axis times the square of another: a change of
+        the scale factor of the latter by the reading of the former, on whichever of
+        the two it acts."""
         reference = self.rows.problem.reference
         along = np.einsum("ni,nip->np", self.s, basis)
         for axis, other in permutations(range(AXES), 2):
@@ -440,7 +441,7 @@ class _Data:
                 yield replace(on_axis, loading=on_axis.loading * gain)
 
     def _by_covariate(self, effect: Effect, index: Ints, axis: int, basis: Floats) -> Iterator[_Driver]:
-        """On the bias of the axis, or on its scale factor."""
+        """Driver by a covariate, on the bias of the axis or on its scale factor."""
         name = _driving(effect, axis)
         if name is None:
             return
@@ -458,7 +459,7 @@ class _Data:
             return at(x, {n: np.full(len(x), v) for n, v in median.items()})
 
         on_axis = replace(self.on_axis(name, axis, problem.channels[name], functions), rows=rows)
-        # A step inside a pose goes by that pose's own duration.
+        # The duration of its own pose decides a step inside a pose.
         durations = {n: self.covariates[n] for n in effect.needs if n == DURATION}
         in_poses = at(on_axis.x, {n: np.full(self.rows.n, v) for n, v in median.items()} | durations)
         for gain in (np.ones(self.rows.n), self.s[:, axis] / problem.reference):
@@ -466,8 +467,8 @@ class _Data:
                 yield replace(on_axis, loading=on_axis.loading * gain)
 
     def of_reading(self, axis: int, functions: Callable[[Floats], Floats]) -> _Driver:
-        """Of |a|, by the reading of an axis. The nine parameters take away its
-        square, itself and a constant, which is the square of all three."""
+        """Driver of |a| by the reading of an axis. The nine parameters absorb its
+        square, itself and a constant (the sum of all three squares)."""
         return _Driver(
             variable=READINGS[axis],
             quantity=Quantity.MAGNITUDE,
@@ -481,8 +482,8 @@ class _Data:
         )
 
     def on_axis(self, variable: str, axis: int, x: Floats, functions: Callable[[Floats], Floats]) -> _Driver:
-        """On the bias of an axis, from which the nine parameters take a
-        constant away."""
+        """Driver on the bias of an axis, of which the nine parameters absorb a
+        constant."""
         return _Driver(
             variable=variable,
             quantity=Quantity.READING,
@@ -495,10 +496,10 @@ class _Data:
             rows=np.ones(self.rows.n, dtype=bool),
         )
 
-    # What tells most where nothing has a name.
+    # The most telling variables of an unexplained residual.
 
     def candidates(self) -> Iterator[Sequence[_Driver]]:
-        """Each variable, with the axes on which it may act."""
+        """Drivers of each variable, one for each axis on which it may act."""
         for axis in range(AXES):
             yield [self.of_reading(axis, _Polynomials.over(self.s[:, axis], OF_READING))]
         still = static_covariates(self.rows.poses)
@@ -508,8 +509,10 @@ class _Data:
                 yield [self.on_axis(name, axis, x, functions) for axis in _axes_of(name)]
 
     def fitted(self, drivers: Sequence[_Driver]) -> _Curve | None:
-        """The polynomials in one variable, beside the nine parameters; None
-        where these leave nothing of them, or no degree of freedom."""
+        """Polynomials in one variable, fitted together with the nine parameters; None
+        where these absorb them, or no degree of freedom is left."""
+        # Project the columns off the nine parameters (Frisch–Waugh–Lovell), then
+        # regress.
         columns = self.left(self.columns(drivers))[self.in_fit]
         misfit = (-self.residual / self.error)[self.in_fit]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -518,6 +521,7 @@ class _Data:
         before = float(misfit @ misfit)
         if rank == 0 or free <= rank or not before > 0:
             return None
+        # Mean squares with and without the curve, covariance, F test.
         after = float(np.sum((misfit - columns @ q) ** 2)) / (free - rank)
         inverse = np.linalg.pinv((columns / size).T @ (columns / size), rcond=SAME, hermitian=True)
         covariance = max(1.0, after) * inverse / np.outer(size, size)
@@ -527,14 +531,13 @@ class _Data:
         return _Curve(drivers, _Coefficients(q, covariance, coverage), 1 - after / (before / free), p_value)
 
     def columns(self, drivers: Sequence[_Driver]) -> Floats:
-        """(N,p) as `LinearisedData.by_coefficients` has them, in the means
-        alone."""
+        """(N,p) as `LinearisedData.by_coefficients`, in the means alone."""
         each = [driver.loading[:, None] * driver.functions(driver.x) / self.error[:, None] for driver in drivers]
         means = -np.concatenate(each, axis=1)
         return np.concatenate([means, np.zeros((len(self.rows.y) - self.rows.n, means.shape[1]))])
 
     def trace_of_curve(self, fit: _Curve, p_value: float) -> Trace:
-        """On the axis on which it does most."""
+        """The trace on the axis with the largest contribution."""
         contribution, of = self.contribution(self.columns(fit.drivers)), fit.coefficients
         parts = np.array_split(np.arange(len(of.values)), len(fit.drivers))
         best = max(range(len(parts)), key=lambda k: self.weight(contribution[:, parts[k]] @ of.values[parts[k]]))
@@ -545,8 +548,8 @@ class _Data:
 
 
 def unit_of(variable: str) -> str:
-    """Of a variable of a trace; g stands for the unit of the reference, and the
-    name of a channel in brackets for that of the channel."""
+    """The unit of a trace's variable; g stands for the unit of the reference, a
+    channel's name in brackets for that of the channel."""
     if variable in (POSE, RUN):
         return ""
     if variable in (*READINGS, PREDICTED, *BEFORE, *CHANGE):
@@ -563,16 +566,15 @@ def unit_of(variable: str) -> str:
 
 
 def _groups(effect: Effect) -> list[Ints]:
-    """The coefficients that belong together: of one part, and of one of several
-    recordings."""
+    """Indices of the coefficients of one part, and of one recording among several."""
     keys = [(c.part, runs_named([c.name]) if RUN not in effect.needs[:1] else ()) for c in effect.coefficients]
     return [np.array([i for i, other in enumerate(keys) if other == key]) for key in dict.fromkeys(keys)]
 
 
 def _of_other_recordings(effect: Effect, index: Ints) -> Ints:
-    """The coefficients of the same part in other recordings. What these have in
-    common is also the unit's own bias, which no picture of one recording
-    shows: its band is that beside the others."""
+    """Indices of the coefficients of the same part in other recordings. Their common
+    value is also the unit's own bias, which no picture of one recording shows: its
+    band is conditional on the others."""
     part = effect.coefficients[index[0]].part
     own = set(index.tolist())
     runs = runs_named(effect.coefficients[i].name for i in index)
@@ -581,17 +583,16 @@ def _of_other_recordings(effect: Effect, index: Ints) -> Ints:
 
 
 def _driving(effect: Effect, axis: int) -> str | None:
-    """The one covariate that drives an effect on an axis; None where it is not
-    one."""
+    """The one covariate that drives an effect on an axis, or None."""
     names = [n for n in effect.needs if n not in (DURATION, RUN)] or [n for n in effect.needs if n == RUN]
     own = [n for n in names if n in (BEFORE[axis], CHANGE[axis], SCATTER[axis])] or names
     return own[0] if len(own) == 1 else None
 
 
 def _axes_of(covariate: str) -> Sequence[int]:
-    """On which a variable without a name may act: what is an axis's own on that
-    one. The pose before stands for the change too, time since the start for
-    time, and a channel for its lags."""
+    """Axes on which an unexplained variable may act: its own axis for an
+    axis-specific variable. The previous pose also represents the change, time since
+    the start represents time, and a channel represents its lags."""
     if covariate in (*BEFORE, *SCATTER):
         return ["xyz".index(covariate[-1])]
     rate = covariate.endswith(rate_of("")) and not lag_in(covariate)
@@ -599,8 +600,8 @@ def _axes_of(covariate: str) -> Sequence[int]:
 
 
 def _on_sphere(x: Floats, axis: int, reference: float) -> Floats:
-    """(k,3) readings of the length of the reference, x along the axis and the
-    rest in equal parts along the others."""
+    """(k,3) readings with the length of the reference: x along the axis, the rest in
+    equal parts along the others."""
     rest = np.sqrt(np.maximum(reference**2 - x**2, 0.0) / 2)
     return np.stack([x if i == axis else rest for i in range(AXES)], axis=1)
 

@@ -1,10 +1,11 @@
-"""What several units, or recordings, show together: whether an effect acts in
-all, then whether its values are common.
+"""The pooled analysis of several units or recordings: whether an effect acts in all,
+and whether its values are common.
 
-An effect that no unit shows for certain may be certain in all of them together.
-So existence is asked of the product of their evidences: one name, form, shape
-and size for all, and coefficients of its own for each unit, or the same. Its
-competitor is that each unit is for itself, with its own posterior."""
+An effect that no unit shows for certain may be certain in all of them together. The
+product of their evidences decides: one name, form, shape and size for all, with
+coefficients of their own or in common. The competing model is that the units are
+independent, each with its own posterior.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +22,19 @@ from triaxcal.evidence.posterior import Posterior, Shape, shapes_by
 from triaxcal.evidence.search import NEGLIGIBLE_LOG_RATIO, BaseModel, base_models, log_ratio_without, log_ratios
 from triaxcal.evidence.terms import Term
 
-# The evidence of coefficients that several units have in common, by Laplace's
-# method.
+# The evidence of coefficients that several units share, by Laplace's method.
 
 STEPS = 6
-"""Towards coefficients that units share: each weighs the units by the noise
-that is left in them."""
+"""Iterations for shared coefficients: each weights the units by the present estimate
+of their noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class TermEquations:
-    """Of each term of a name the information (q,q) and score (q,) of its scaled
-    coefficients, in standard errors, beside one set with one part and one
-    choice of sizes that leave ``chi2``. Its share of the unit by itself is
-    ``log_share``; ``variance`` is that of the noise where one more term
-    explains what it can."""
+    """Information (q,q) and score (q,) of the scaled coefficients of each term of a
+    name, in standard errors, conditional on one set with one part and one choice of
+    sizes, of chi-square ``chi2``. ``log_share`` is its share of the unit by itself;
+    ``variance`` is the noise variance with the best further term."""
 
     of_terms: Mapping[int, tuple[Floats, Floats]]
     chi2: float
@@ -44,10 +43,11 @@ class TermEquations:
 
 
 def term_equations(unit: Posterior, bases: Sequence[BaseModel], name: str, none: bool) -> TermEquations:
-    """Beside what explains most with one more term of this name; without an
-    unmodelled part, where ``none``."""
+    """Conditional on the set with the best further term of this name; without an
+    unmodelled part where ``none``."""
     evidence = unit.evidence
     mine = [i for i, term in enumerate(evidence.terms) if term.name == name]
+    # The likeliest set, part and sizes without the name.
     others = [base for base in bases if name not in base.names]
     found = max(others, key=lambda base: base.with_each[mine].max()).found
     row = found.parts.index(0) if none and 0 in found.parts else int(np.argmax(found.by_part))
@@ -60,16 +60,16 @@ def term_equations(unit: Posterior, bases: Sequence[BaseModel], name: str, none:
 
 
 def _explained(information: Floats, score: Floats) -> float:
-    """By how much a term lowers the sum of squares, at most."""
+    """Largest reduction in chi-square by a term: sᵀ I⁺ s."""
     return float(score @ np.linalg.pinv(information) @ score)
 
 
 def of_common_values(units: Sequence[Posterior], equations: Sequence[TermEquations], index: Sequence[int]) -> Floats:
-    """(R,) log evidence with a term over that without, one for each size, where
-    the coefficients are common to all units: by Laplace's method about the
-    coefficients that explain most, as the noise of no unit is known beforehand.
-    Two such points are looked for, since a unit may as well lack the effect and
-    be noisy."""
+    """(R,) log evidence with a term over that without, for each size, with
+    coefficients common to all units: Laplace's method about their best values, since
+    the noise of no unit is known in advance. Two starting points are used, because a
+    unit may lack the effect and be noisy."""
+    # Rescale the coefficients of every unit to those of the first.
     first = units[0].evidence.terms[index[0]]
     scaled = []
     for unit, of_unit, i in zip(units, equations, index, strict=True):
@@ -90,13 +90,13 @@ def of_common_values(units: Sequence[Posterior], equations: Sequence[TermEquatio
 def _laplace_log_evidence(
     units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats
 ) -> Floats:
-    """(R,) the logarithm of the evidence of coefficients that U units share
-    over that of none, for each size. Of each unit ``information`` (U,q,q),
-    ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances
-    of the noise."""
+    """(R,) log evidence of coefficients shared by U units over that of none, for each
+    size. ``information`` (U,q,q), ``score`` (U,q) and ``chi2`` (U,) of each unit
+    without them; ``start`` (U,) are initial noise variances."""
     size = units[0].evidence.sizes
     prior = np.eye(score.shape[1]) / size[:, None, None] ** 2
     variance = np.broadcast_to(start, (len(size), len(units)))
+    # Alternate: shared coefficients for the present noise, then noise of every unit.
     for _ in range(STEPS):
         precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
         values = np.linalg.solve(precision, ((1 / variance) @ score)[:, :, None])[:, :, 0]
@@ -105,6 +105,7 @@ def _laplace_log_evidence(
         variance = np.array(
             [[u.evidence.rows.noise_variance_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
         )
+    # Laplace: ln likelihood at the maximum + ln prior − ½ ln|precision|.
     gain = np.zeros(len(size))
     for k, unit in enumerate(units):
         rows = unit.evidence.rows
@@ -120,14 +121,14 @@ Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Pooled:
-    """Hypotheses are that one effect acts in every unit, of one form, shape and
-    size, or that each unit is for itself.
+    """Hypotheses: one effect acts in every unit, of one form, shape and size, or the
+    units are independent.
 
-    ``shared`` is the probability of the first by name,
-    ``independent_probability`` that of the second. ``probability`` is that each
-    effect acts in every unit, whatever else does, the likeliest first;
-    ``common`` that its values then are one for all, and ``shapes`` has what its
-    shape is. ``nothing`` is the probability that no effect acts in any unit.
+    ``shared`` is the probability of the former by name, ``independent_probability``
+    that of the latter. ``probability`` is the probability that each effect acts in
+    every unit, whatever else does, the likeliest first; ``common`` that its values
+    are then the same, and ``shapes`` has its shape. ``nothing`` is the probability
+    that no effect acts in any unit.
     """
 
     units: Sequence[Posterior]
@@ -139,9 +140,8 @@ class Pooled:
     nothing: float
 
     def one_of(self, names: Sequence[str]) -> float:
-        """The probability that one of these effects, the same, acts in every
-        unit; at least, where units that share nothing may have several of
-        them."""
+        """Probability that one of these effects, the same one, acts in every unit; a
+        lower bound, since independent units may have several of them."""
         total = self.independent_probability * max(
             _product(unit.effect_probabilities.get(name, 0.0) for unit in self.units) for name in names
         )
@@ -149,14 +149,13 @@ class Pooled:
             if other in names:
                 total += p
             elif p > np.exp(-NEGLIGIBLE_LOG_RATIO):
-                total += p * max(_product(_acts_beside(unit, name, other) for unit in self.units) for name in names)
+                total += p * max(_product(_acts_given(unit, name, other) for unit in self.units) for name in names)
         return total
 
     def certain(self, level: float) -> tuple[tuple[str, ...], ...]:
-        """Groups of names, in each of which one acts in every unit with this
-        probability: names alone, and the fewest of the others, the likeliest
-        first. Names that hold each other's columns, as temperature and its
-        square, stand together."""
+        """Groups of names, one of which acts in every unit with this probability:
+        single names, and the smallest group of the others, the likeliest first. Names
+        that share columns, such as temperature and its square, form groups."""
         alone = [name for name, p in self.probability.items() if p >= level]
         out = [(name,) for name in alone]
         rest = [name for name, p in self.probability.items() if 1 - level <= p < level]
@@ -167,9 +166,9 @@ class Pooled:
 
 
 def pool(units: Sequence[Posterior]) -> Pooled:
-    """Of units whose posteriors are of one catalogue and one grid of sizes
-    (`Posterior.resized`). Names that some unit cannot show are left out. Where
-    an effect acts in all, another is asked about beside it."""
+    """The pooled analysis of units with one catalogue and one grid of sizes
+    (`Posterior.resized`). Names that some unit cannot show are omitted. Where an
+    effect acts in all, the analysis is repeated conditional on it."""
     found, given = _pooled_conditional_on(units, frozenset()), units
     odds, acting = units[0].evidence.odds, list[str]()
     while len(acting) < odds.together - 1:
@@ -184,8 +183,8 @@ def pool(units: Sequence[Posterior]) -> Pooled:
 
 
 def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
-    """With what was asked beside an effect that acts in all with probability
-    ``p``."""
+    """``found``, updated by the analysis ``more`` that is conditional on an effect of
+    probability ``p``."""
     better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
     of_names = dict(found.probability) | better
     return replace(
@@ -197,7 +196,8 @@ def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
 
 
 def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
-    """Beside effects that are ``acting`` in all sets of every unit."""
+    """The pooled analysis conditional on effects that are ``acting`` in every
+    unit."""
     terms = [_terms(unit.evidence) for unit in units]
     forms = [form for form in terms[0] if form[0] not in acting and all(form in of_unit for of_unit in terms)]
     bases = [base_models(unit, acting) for unit in units]
@@ -225,9 +225,9 @@ def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """Of one name, for each of its forms and shapes, which are the ``terms`` of
-    the first unit: logarithms of the evidence, with priors, where each unit has
-    its ``own`` values and where all have them in ``common``."""
+    """Scores of one name for each of its forms and shapes, the ``terms`` of the first
+    unit: log evidence with priors, with values of each unit's ``own`` and with
+    ``common`` values."""
 
     terms: Sequence[Term]
     own: Sequence[float]
@@ -237,7 +237,7 @@ class _Scores:
     def of(
         cls, units: Sequence[Posterior], bases: Sequence[Sequence[BaseModel]], name: str, alike: Sequence[Sequence[int]]
     ) -> _Scores:
-        """``alike`` are the terms of each unit that are of one form and shape."""
+        """``alike`` are the terms of each unit with the same form and shape."""
         first = units[0].evidence
         rescaled = float(np.log(first.odds.pooled_effect_probability / first.odds.effect_odds))
         ratios = [log_ratios(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
@@ -262,12 +262,12 @@ class _Scores:
 
     @property
     def common_probability(self) -> float:
-        """That all units have the same values, if the effect acts in all."""
+        """Probability of common values, given that the effect acts in all units."""
         return float(np.exp(log_sum_exp(self.common) - self.total))
 
     @property
     def weights(self) -> Floats:
-        """The probability of each form and shape, likewise."""
+        """Probability of each form and shape, given that the effect acts."""
         return np.asarray(np.exp(np.logaddexp(self.own, self.common) - self.total))
 
 
@@ -275,8 +275,8 @@ def _product(probabilities: Iterable[float]) -> float:
     return float(np.prod([*probabilities]))
 
 
-def _acts_beside(unit: Posterior, name: str, other: str) -> float:
-    """The probability that an effect acts in a unit in which the other does."""
+def _acts_given(unit: Posterior, name: str, other: str) -> float:
+    """Probability of an effect in a unit, given another effect."""
     with_other = {names: p for names, p in unit.effect_set_probabilities.items() if other in names}
     total = sum(with_other.values())
     return sum(p for names, p in with_other.items() if name in names) / total if total > 0 else 0.0
@@ -287,7 +287,7 @@ def _mean(by_size: Floats) -> float:
 
 
 def _terms(evidence: Evidence) -> dict[Form, list[int]]:
-    """The terms of each form, one for each shape that it is asked about with."""
+    """The terms of each form, one for each shape."""
     out: dict[Form, list[int]] = defaultdict(list)
     for i, term in enumerate(evidence.terms):
         if term.effect is not None:
@@ -298,9 +298,8 @@ def _terms(evidence: Evidence) -> dict[Form, list[int]]:
 def _alike(
     units: Sequence[Posterior], terms: Sequence[Mapping[Form, list[int]]], forms: Sequence[Form]
 ) -> Iterator[list[int]]:
-    """Of every form and shape of the first unit the term in each unit whose
-    shape comes nearest: units that were held still at other times have other
-    grids of shapes."""
+    """For every form and shape of the first unit, the term of each unit with the
+    nearest shape: units with other pose times have other grids of shapes."""
     for form in forms:
         shapes = [
             np.array([_shape_of(unit.evidence.terms[i]) for i in of_unit[form]])

@@ -1,5 +1,5 @@
-"""The posterior: how probable each name, each outlier and an unmodelled part
-are, over all likely sets of terms."""
+"""The posterior probabilities of effects, outliers and unmodelled parts, over all
+likely sets of terms."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.rounding import reaches
 
 EQUAL = 9
-"""Decimals to which two probabilities are equal: their order is then that of
-their names, and not that of their last bits."""
+"""Decimals to which two probabilities are equal; their order is then that of their
+names."""
 PARTS = 3
-"""Unmodelled parts beside which a name is asked about without a pose, the
-likeliest beside the name."""
+"""Number of unmodelled parts, the likeliest with the name, in the leave-one-out
+analysis."""
 LEFT_OUT = 200
-"""Poses at most without which a name is asked about: of more, any one decides
-little."""
+"""Number of poses that are left out one at a time; in larger sets a single pose
+decides little."""
 ALTERNATIVES = 8
-"""Names at most among which alternatives are looked for, the likeliest."""
+"""Number of names, the likeliest, among which competing models are sought."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """``sets`` are all likely sets of terms, the best first."""
+    """The posterior over ``sets``, all likely sets of terms, the best first."""
 
     evidence: Evidence
     sets: Sequence[SetEvidence]
@@ -54,20 +54,19 @@ class Posterior:
         return frozenset(pose for pose in poses if pose >= 0)
 
     def resized(self, smallest_g: float) -> Posterior:
-        """The same sets with effects of sizes that begin at ``smallest_g``:
-        several units that are compared have one grid."""
+        """The same sets with sizes of effects from ``smallest_g``: units in a
+        comparison need one grid."""
         evidence = self.evidence.resized(smallest_g)
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
 
     def conditional_on(self, name: str) -> Posterior:
-        """If this effect acts."""
+        """The posterior given that this effect acts."""
         return Posterior(self.evidence, [found for found in self.sets if name in self.names_of(found)])
 
     @cached_property
     def effect_probabilities(self) -> Mapping[str, float]:
-        """The probability that each effect acts, whatever acts beside it, the
-        likeliest first."""
+        """Marginal probability of each effect, the likeliest first."""
         out: dict[str, float] = defaultdict(float)
         for w, found in zip(self.set_probabilities, self.sets, strict=True):
             for name in sorted(self.names_of(found)):  # in one order in every process
@@ -76,8 +75,7 @@ class Posterior:
 
     @cached_property
     def effect_set_probabilities(self) -> Mapping[frozenset[str], float]:
-        """The probability that these effects act and no other, the likeliest
-        first."""
+        """Probability of each set of effects and no other, the likeliest first."""
         out: dict[frozenset[str], float] = defaultdict(float)
         for w, found in zip(self.set_probabilities, self.sets, strict=True):
             out[self.names_of(found)] += float(w)
@@ -102,8 +100,8 @@ class Posterior:
 
     @cached_property
     def change_point_probabilities(self) -> Floats:
-        """(n,) the probability that from each pose on there is another unit, or
-        another mounting."""
+        """(n,) the probability that another unit, or another mounting, begins with
+        each pose."""
         out = np.zeros(self.evidence.rows.n)
         for p, term in zip(self.term_probabilities, self.evidence.terms, strict=True):
             if term.change_point >= 0:
@@ -112,8 +110,7 @@ class Posterior:
 
     @cached_property
     def part_probabilities(self) -> Floats:
-        """(P,) the probability of each part of the evidence, the first that
-        there is none."""
+        """(P,) the probability of each unmodelled part; the first is that of none."""
         out = np.zeros(len(self.evidence.parts))
         for found in self.sets:
             out[list(found.parts)] += np.exp(found.by_part - self._total)
@@ -121,8 +118,7 @@ class Posterior:
 
     @property
     def unmodelled_probability(self) -> float:
-        """The probability that something acts on the means which no name
-        describes."""
+        """The probability of an unmodelled part that acts on the pose means."""
         parts = zip(self.part_probabilities, self.evidence.parts, strict=True)
         return float(
             sum(p for p, part in parts if part.kind is not None and part.kind.what != UnmodelledKind.WITHIN_POSE)
@@ -144,9 +140,8 @@ class Posterior:
 
     @cached_property
     def certain(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of names, in each of which one acts for certain. A name alone
-        is known, whichever pose were an outlier; of several it is known that
-        one of them acts."""
+        """Groups of names, each with one that acts for certain. A name alone is
+        certain even if any one pose were an outlier."""
         level = self.evidence.odds.certain
         out: list[tuple[str, ...]] = []
         rest: list[str] = []
@@ -161,8 +156,8 @@ class Posterior:
         return tuple(out)
 
     def _alternatives(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The fewest of these of which one acts for certain, the likeliest
-        first; none where nothing is certain."""
+        """The smallest group of names one of which acts for certain, the likeliest
+        first; empty where there is none."""
         for size in range(2, min(len(names), ALTERNATIVES) + 1):
             groups = itertools.combinations(names[:ALTERNATIVES], size)
             best = max(groups, key=self.any_of)
@@ -171,21 +166,21 @@ class Posterior:
         return ()
 
     def least_leave_one_out(self, name: str) -> float:
-        """The probability of a name if that pose were an outlier which it takes
-        most to explain."""
+        """The probability of a name if the pose that supports it most were an
+        outlier."""
         return float(self.leave_one_out(name).min())
 
     def leave_one_out(self, name: str) -> Floats:
-        """(n,) the probability of a name if that pose were an outlier: beside
-        the likeliest set with the name, less the name. As it is, where the pose
-        is one of that set's outliers, or one of many that tell little."""
+        """(n,) the probability of a name if each pose were an outlier, conditional on
+        the likeliest set with the name, less the name. Unchanged for the outliers of
+        that set, and for those of many poses that carry little information."""
         if name not in self._without:
             self._without[name] = self._leave_one_out_of(name)
         return self._without[name]
 
     @cached_property
     def _without(self) -> dict[str, Floats]:
-        """What was asked before."""
+        """Cached results."""
         return {}
 
     def _leave_one_out_of(self, name: str) -> Floats:
@@ -194,12 +189,14 @@ class Posterior:
         best = next((found for found in self.sets if name in self.names_of(found)), None)
         if best is None:
             return out
+        # The likeliest set without the name, and its likeliest parts.
         rest = tuple(i for i in best.members if evidence.terms[i].name != name)
         mine = np.array([term.name == name for term in evidence.terms])
         rows = np.argsort(-best.by_part)[:PARTS]
         parts = sorted({0, *(best.parts[row] for row in rows)})
         for i in self._telling(best, name):
             term = evidence.terms[i]
+            # Add an outlier at the pose; compare all terms with the name to all others.
             members = tuple(sorted((*rest, i)))
             base = evidence.of_set(members, parts)
             others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
@@ -210,10 +207,10 @@ class Posterior:
         return out
 
     def _telling(self, best: SetEvidence, name: str) -> list[int]:
-        """The terms of the outliers that are asked about, beside the likeliest
-        set with that name: of many poses those without which its effect would
-        explain least."""
+        """Outlier terms of the leave-one-out analysis of the likeliest set with that
+        name. Of many poses, those without which the effect would explain least."""
         evidence = self.evidence
+        # Sizes of the best cell of the set.
         row = int(np.argmax(best.by_part))
         sizes = dict(zip(best.members, best.sizes[int(np.argmax(best.log[row]))], strict=True))
         outliers = [i for i, term in enumerate(evidence.terms) if term.pose >= 0 and i not in sizes]
@@ -221,6 +218,7 @@ class Posterior:
             return outliers
         (effect,) = (i for i in best.members if evidence.terms[i].name == name)
         rest = [i for i in best.members if i != effect]
+        # Reduction in chi-square by the effect without each pose.
         explained = evidence.explained_without(
             best.parts[row], rest, [sizes[i] for i in rest], (effect, sizes[effect]), outliers
         )
@@ -231,8 +229,7 @@ class Posterior:
         return float(log_sum_exp([found.total for found in self.sets]))
 
 
-# The shape of an effect, a time constant or the moment of a step, as the posterior
-# has it.
+# The posterior of the shape of an effect: a time constant, or the moment of a step.
 
 AT_AN_END = 0.5
 """If an end value of the grid holds more than this probability, the data do not
@@ -241,8 +238,8 @@ bound the shape. No standard error is given then."""
 
 @dataclass(frozen=True)
 class Shape:
-    """Mean and standard deviation. ``standard_error`` is None where the poses
-    do not tell it: it lies at an end of what was asked about."""
+    """Posterior mean and standard deviation. ``standard_error`` is None where the
+    shape lies at an end of its grid."""
 
     value: float
     standard_error: float | None
@@ -250,15 +247,15 @@ class Shape:
 
 
 def shapes_of(posterior: Posterior, name: str) -> Mapping[str, Shape]:
-    """Of an effect, by the name of the shape, if that effect acts; none where
-    it has none."""
+    """Posterior shapes of an effect by name, given that it acts; empty where it has
+    none."""
     terms, weights = posterior.evidence.terms, posterior.term_probabilities
     mine = [i for i, term in enumerate(terms) if term.effect is not None and term.name == name]
     return shapes_by([terms[i] for i in mine], weights[mine]) if weights[mine].any() else {}
 
 
 def shapes_by(terms: Sequence[Term], weights: Floats) -> Mapping[str, Shape]:
-    """Of terms of one name, with their weights (n,)."""
+    """Shapes by name from terms of one effect, with their weights (n,)."""
     every = [{} if term.effect is None else term.effect.shape for term in terms]
     out = {}
     for name, unit in {name: unit for shape in every for name, (_, unit) in shape.items()}.items():
@@ -269,8 +266,8 @@ def shapes_by(terms: Sequence[Term], weights: Floats) -> Mapping[str, Shape]:
 
 
 def _spread(values: Floats, weights: Floats) -> tuple[float, float | None]:
-    """Each value of the grid stands for all that are nearer to it than to any
-    other."""
+    """Weighted mean and standard deviation over grid cells: each value represents its
+    cell, so width²/12 of a rectangular distribution is added."""
     grid, which = np.unique(values, return_inverse=True)
     share = np.bincount(which, weights)
     share = share / share.sum()

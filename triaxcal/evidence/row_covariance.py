@@ -1,9 +1,8 @@
-"""Covariances of all rows, and their inverses, without a matrix of so many rows.
+"""Covariances of all rows and their inverses, without dense matrices.
 
-A row has a variance by itself, or a function of few degrees of freedom goes
-through all of them. Both leave of the noise a diagonal matrix and a few axes.
-Nothing is inverted that may be singular: an axis has so much of the variance,
-between none and all, and that share is what the inverse lacks.
+A covariance is diagonal, or of low rank on top of the unit noise. Both give an
+inverse with a diagonal and a few axes. No singular matrix is inverted: for each axis
+the inverse lacks a share between 0 and 1.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ import numpy as np
 from triaxcal.arrays import Floats
 
 NOTHING = 1e-9
-"""A share of the variance of the noise that shows in no figure."""
+"""Share of the noise variance that is negligible."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowPrecision:
-    """A symmetric matrix (N,N), applied by ``@`` from either side: the diagonal
-    ``weight`` (N,), less the share ``taken`` (k,) along each of the ``axes``
-    (N,k). ``half_log_det`` is half the logarithm of its determinant."""
+    """A symmetric matrix (N,N), applied by ``@`` from either side: diag(``weight``) −
+    A diag(``taken``) Aᵀ with weight (N,), axes A (N,k) and taken (k,).
+    ``half_log_det`` is half the logarithm of its determinant."""
 
     weight: Floats
     axes: Floats
@@ -34,18 +33,18 @@ class RowPrecision:
     __array_ufunc__ = None  # an array leaves ``@`` to this class
 
     def __matmul__(self, columns: Floats) -> Floats:
-        """Times columns (N,) or (N,q)."""
+        """The matrix times columns (N,) or (N,q)."""
         along = (self.axes.T @ columns).T * self.taken
         return np.asarray((columns.T * self.weight - along @ self.axes.T).T)
 
     def __rmatmul__(self, rows: Floats) -> Floats:
-        """Rows (N,) or (q,N) times it."""
+        """Rows (N,) or (q,N) times the matrix."""
         return np.asarray((self @ rows.T).T)
 
 
 @dataclass(frozen=True, eq=False)
 class OwnVariances:
-    """``variances`` (N,) that each row has by itself."""
+    """Independent ``variances`` (N,) of the rows."""
 
     variances: Floats
 
@@ -53,7 +52,7 @@ class OwnVariances:
         return OwnVariances(scale * self.variances)
 
     def beyond(self, basis: Floats) -> Floats:
-        """(N,) of what an orthonormal ``basis`` (N,r) leaves."""
+        """(N,) variances after projection off an orthonormal ``basis`` (N,r)."""
         share = basis**2
         crossed = (basis.T * self.variances) @ basis
         return np.asarray(
@@ -61,17 +60,19 @@ class OwnVariances:
         )
 
     def precision(self, tau: float) -> RowPrecision:
-        """Of noise with a variance of one, and this in units of ``tau``."""
+        """Inverse of 1 + τ² diag(variances)."""
         weight = 1 / (1 + tau**2 * self.variances)
         return RowPrecision(weight, np.empty((len(weight), 0)), np.empty(0), 0.5 * float(np.log(weight).sum()))
 
     def precisions_beyond(self, basis: Floats, taus: Sequence[float]) -> list[RowPrecision]:
-        """Of what an orthonormal ``basis`` (N,r) leaves, in each of these units."""
+        """The same for each τ, after projection off an orthonormal ``basis``
+        (N,r)."""
         return [_beyond(self.precision(tau), basis) for tau in taus]
 
 
 def _beyond(whole: RowPrecision, basis: Floats) -> RowPrecision:
-    """Of a diagonal one what a ``basis`` leaves."""
+    """P − P B (Bᵀ P B)⁻¹ Bᵀ P for a diagonal P: projection off the ``basis`` B in its
+    metric."""
     weighted = basis * whole.weight[:, None]
     value, axes = np.linalg.eigh(basis.T @ weighted)
     value = np.maximum(value, np.finfo(float).tiny)
@@ -81,8 +82,8 @@ def _beyond(whole: RowPrecision, basis: Floats) -> RowPrecision:
 
 @dataclass(frozen=True, eq=False)
 class LowRank:
-    """The covariance of functions of few degrees of freedom: ``factor`` (N,r)
-    times its transpose."""
+    """Covariance F Fᵀ of functions of few degrees of freedom; ``factor`` F is
+    (N,r)."""
 
     factor: Floats
 
@@ -91,20 +92,20 @@ class LowRank:
 
     @property
     def variances(self) -> Floats:
-        """(N,) of the rows."""
+        """(N,) variances of the rows."""
         return np.asarray(np.sum(self.factor**2, axis=1))
 
     def beyond(self, basis: Floats) -> Floats:
-        """(N,) variances of what an orthonormal ``basis`` (N,r) leaves."""
+        """(N,) variances after projection off an orthonormal ``basis`` (N,r)."""
         return self._left_by(basis).variances
 
     def precision(self, tau: float) -> RowPrecision:
-        """Of noise with a variance of one, and this in units of ``tau``."""
+        """Inverse of 1 + τ² F Fᵀ."""
         return _precision(*self._principal(tau), tau)
 
     def precisions_beyond(self, basis: Floats, taus: Sequence[float]) -> list[RowPrecision]:
-        """Of what an orthonormal ``basis`` (N,r) leaves, in each of these
-        units."""
+        """The same for each τ, after projection off an orthonormal ``basis``
+        (N,r)."""
         axes, variance = self._left_by(basis)._principal(max(taus))
         whole, taken = np.concatenate([basis, axes], axis=1), np.ones(basis.shape[1])
         each = (_precision(axes, variance, tau) for tau in taus)
@@ -114,8 +115,8 @@ class LowRank:
         return LowRank(self.factor - basis @ (basis.T @ self.factor))
 
     def _principal(self, tau: float) -> tuple[Floats, Floats]:
-        """Axes (N,k) and the variances (k,) along them, that show in the noise
-        in units of ``tau``."""
+        """Principal axes (N,k) and variances (k,) that are not negligible at size
+        τ."""
         if not self.factor.size:
             return self.factor, np.empty(0)
         axes, variance = self._all_principal
@@ -129,9 +130,10 @@ class LowRank:
 
 
 def inverse_of(precision: Floats) -> Floats:
-    """(…,d,d) of symmetric matrices (…,d,d). Combinations that the data show no
-    better than rounding keep the width that rounding gives them, which is as
-    good as none known."""
+    """(…,d,d) inverses of symmetric matrices (…,d,d). Combinations that are
+    determined no better than rounding get the variance that rounding gives them,
+    effectively unknown."""
+    # Scale to a unit diagonal, then invert with a floor on the eigenvalues.
     size = np.sqrt(np.maximum(np.diagonal(precision, axis1=-2, axis2=-1), np.finfo(float).tiny))
     scaled = precision / size[..., :, None] / size[..., None, :]
     value, axes = np.linalg.eigh(scaled)
@@ -141,5 +143,6 @@ def inverse_of(precision: Floats) -> Floats:
 
 
 def _precision(axes: Floats, variance: Floats, tau: float) -> RowPrecision:
+    # (1 + τ² A v Aᵀ)⁻¹ = 1 − A (1 − 1/(1 + τ² v)) Aᵀ.
     spread = 1 + tau**2 * variance
     return RowPrecision(np.ones(len(axes)), axes, 1 - 1 / spread, -0.5 * float(np.log(spread).sum()))

@@ -26,23 +26,22 @@ from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
-from triaxcal.progress import Progress, Stage, untold
+from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 
-# One unit's evidence with a further term, and without a name: what the pooled
-# analysis of several units multiplies.
+# One unit's evidence with a further term and without a name: the factors of the
+# pooled analysis.
 
 BASE_SETS = 3
-"""Sets of a unit, the likeliest, beside which an effect is asked about."""
+"""Number of a unit's likeliest sets to which an effect is added."""
 NEGLIGIBLE_LOG_RATIO = 14.0
-"""In the logarithm: parts that are less likely by more add nothing."""
+"""Parts with a log evidence lower by more than this are neglected."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """A set that a further term may stand beside: ``found``, the ``names`` in
-    it, and ``with_each`` (T,R), the logarithm of its evidence with each term at
-    each size, of the sizes one by one."""
+    """A set to which a further term is added: ``found``, the ``names`` in it, and
+    ``with_each`` (T,R), the log evidence of the set with each term at each size."""
 
     found: SetEvidence
     names: frozenset[str]
@@ -50,17 +49,15 @@ class BaseModel:
 
 
 def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
-    """The likeliest sets, and what is left of the likeliest without some of its
-    terms, but for effects that are ``acting``; where none is, the empty set
-    too."""
+    """The likeliest sets, and all subsets of the likeliest; all contain the
+    ``acting`` effects. Where none is acting, the empty set is included."""
     evidence = unit.evidence
     best = unit.sets[0].members
     less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
     some = [*less, *(found.members for found in unit.sets[:BASE_SETS])]
     sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
     known = {found.members: found for found in unit.sets}
-    # Whatever part is likely beside some set: an effect may take the place of a
-    # part.
+    # Every part that is likely with some set: an effect may replace a part.
     likely = [
         row
         for row, part in enumerate(unit.sets[0].parts)
@@ -68,6 +65,8 @@ def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
     ]
     out = []
     for members in sets:
+        # Log evidence with each further term, summed over the parts; the prior of the
+        # sizes is taken out.
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
         rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE_LOG_RATIO).tolist()}
         whole = log_sum_exp([evidence.with_each_further(found, row) for row in sorted(rows)], axis=0)
@@ -77,8 +76,8 @@ def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
 
 
 def log_ratios(unit: Posterior, bases: Sequence[BaseModel], name: str) -> Floats:
-    """(T,R) the logarithm of the evidence of the unit with each term at each
-    size, over that of the unit by itself."""
+    """(T,R) log evidence of the unit with each term at each size, over that of the
+    unit by itself."""
     others = [base for base in bases if name not in base.names]
     with_each = log_sum_exp([base.with_each for base in others], axis=0)
     without = log_sum_exp([base.found.total for base in others])
@@ -86,59 +85,63 @@ def log_ratios(unit: Posterior, bases: Sequence[BaseModel], name: str) -> Floats
 
 
 def log_ratio_without(unit: Posterior, bases: Sequence[BaseModel], name: str) -> float:
-    """The logarithm of the evidence of the unit without that name, over that of
-    the unit by itself."""
+    """Log evidence of the unit without that name, over that of the unit by itself."""
     every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
     others = [found.total for found in every if name not in unit.names_of(found)]
     return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
 
 
-# Which sets of terms are likely: single ones all, larger ones grown from the best
-# (Occam's window).
+# The search for likely sets: all single terms, larger sets grown from the best
+# (Occam's window; Madigan and Raftery 1994).
 
 SINGLES, LARGER = 0.3, 0.8
-"""Shares of the work, about, at which the sets of one term are reckoned, and
-all roughly."""
+"""Approximate shares of the work after which the single terms, and all rough scores,
+are done."""
 Scores = dict[tuple[int, ...], float]
 LEADERS = (12, 6)
-"""Sets of one term that are grown, and of more: two by each choice of names,
-then one."""
+"""Numbers of single terms, and of larger sets, that are grown: two, then one, for
+each choice of names."""
 GROWN = 60
-"""Terms that are put beside one leader, the best."""
+"""Number of the best terms that are added to one leader."""
 MOST = 260
-"""Sets that are reckoned in full. More than so many within the window share
+"""Number of sets with exact evidence. More sets than this within the window share
 what a few leave."""
 ROUGH = 4.0
-"""In the logarithm: by so much the score of a larger set may be off, as it is
-reckoned at the sizes and the parts that its smaller one likes best."""
+"""Log error of the rough score of a larger set: it is computed at the best sizes and
+parts of the smaller set."""
 NO_PART = 1e-3
-"""A part with a smaller share in every leading set is left out of the sums."""
+"""Parts with a smaller share in every leading set are neglected."""
 
 
-def likely_sets(evidence: Evidence, told: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
-    """Those within the window, the best first; the empty one is among them.
-    ``told`` is called with about the share of the work that is done."""
+def likely_sets(evidence: Evidence, report: Callable[[float], None] = lambda done: None) -> list[SetEvidence]:
+    """The sets within Occam's window, the best first, and the empty set. ``report`` is
+    called with the approximate share of the work that is done."""
+    # Evidence of the empty set and of each single term, summed over parts and sizes.
     singles = []
     for part in range(len(evidence.parts)):
         singles.append(evidence.log_evidence_with_each(part))
-        told(SINGLES * part / len(evidence.parts))
+        report(SINGLES * part / len(evidence.parts))
     of_each = log_sum_exp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
     level: Scores = {(i,): float(score) for i, score in enumerate(of_each)}
     scores: Scores = {(): float(log_sum_exp([alone for _, alone in singles]))} | level
+    # Grow sets term by term, with rough scores.
     for depth in range(1, evidence.odds.together):
         level = _grown(evidence, level, depth)
         scores |= level
-        told(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
+        report(SINGLES + (LARGER - SINGLES) * depth / (evidence.odds.together - 1))
+    # Keep the sets within the window of the best.
     window = max(scores.values()) - np.log(evidence.odds.window)
     ranked = sorted(scores, key=lambda members: -scores[members])
     kept = [m for m in ranked if scores[m] > window - (ROUGH if len(m) > 1 else 0.0)][:MOST]
+    # Exact evidence of these.
     parts = _parts_that_matter(evidence, kept[: LEADERS[0]])
     exact = [evidence.of_set(m, parts) for m in dict.fromkeys([*kept, ()])]
     return sorted(exact, key=lambda found: -found.total)
 
 
 def _grown(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: int) -> Scores:
-    """Sets of one more term, each with its rough score."""
+    """Sets of one more term, each with its rough score: the best terms added to each
+    leader."""
     out: Scores = {}
     for members in _leaders(evidence, level, depth):
         scores = _scores_with_each_term(evidence, members)
@@ -150,10 +153,11 @@ def _grown(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: in
 
 
 def _leaders(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: int) -> Iterator[tuple[int, ...]]:
-    """The best of this size, within the window of the best of it."""
+    """The best sets of this size, within the window of the best of them."""
     best = max(level.values(), default=0.0) - np.log(evidence.odds.window)
     count_by_kinds: dict[tuple[str, ...], int] = {}
     most, alike = (LEADERS[0], 2) if depth == 1 else (LEADERS[1], 1)
+    # At most `alike` sets for each choice of names.
     for members in sorted(level, key=lambda m: -level[m]):
         if level[members] < best - ROUGH or sum(count_by_kinds.values()) == most:
             return
@@ -164,9 +168,9 @@ def _leaders(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: 
 
 
 def _scores_with_each_term(evidence: Evidence, members: tuple[int, ...]) -> Floats:
-    """(T,) about the logarithm of the evidence of the members with each term,
-    with all priors: at the sizes that are best for the members, without an
-    unmodelled part and with the three that are likeliest beside the members."""
+    """(T,) approximate log evidence of the members with each term, with all priors:
+    at the best sizes of the members, without an unmodelled part and with its three
+    likeliest parts."""
     alone = evidence.of_set(members, range(len(evidence.parts)))
     likely = np.argsort(-alone.by_part)[:3]
     rows = dict.fromkeys([0, *map(int, likely)])
@@ -180,8 +184,8 @@ def _go_together(evidence: Evidence, members: tuple[int, ...], other: int) -> bo
 
 
 def _nested(one: str, other: str) -> bool:
-    """Whether one of the names has the columns of the other: temperature,
-    linear and quadratic."""
+    """Whether one effect contains the columns of the other: temperature, linear and
+    quadratic."""
     return {one, other} == {"temperature_bias", "temperature_bias_quadratic"}
 
 
@@ -193,17 +197,16 @@ def _parts_that_matter(evidence: Evidence, leaders: list[tuple[int, ...]]) -> li
     return [part for part in range(len(share)) if part == 0 or share[part] > NO_PART]
 
 
-# The posterior of what acts in some poses: linearised anew, and with finer shapes,
-# until neither changes it, or `ROUNDS` times.
+# The posterior: linearise anew and refine the shapes, until neither changes it, or
+# `ROUNDS` times.
 
 ROUNDS = 4
-"""Of linearising anew, each a step of Gauss and Newton, and of dividing shapes."""
+"""Rounds of linearisation (each a Gauss–Newton step) and of refinement of shapes."""
 
 
 def considered(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
-    """The effects of a ``catalogue``, run by run where there are several; where
-    it is None, of all that are known for the channels that move in these
-    poses."""
+    """The effects of a ``catalogue``, run by run where there are several; by default
+    all known effects of the channels that change in these poses."""
     sound = [p for p in poses if not p.fault]
     if catalogue is None:
         catalogue = catalogue_for(set(channels_of(sound)) - static_covariates(sound))
@@ -217,9 +220,10 @@ def posterior_of(
     signs: Sequence[float] = (1, 1, 1),
     catalogue: Sequence[Effect] | None = None,
     odds: Odds | None = None,
-    progress: Progress = untold,
+    progress: Progress = unreported,
 ) -> Posterior:
-    """Of what acts beside the ``linear`` fit of these poses."""
+    """The posterior of effects, outliers and unmodelled parts, conditional on the
+    ``linear`` fit of these poses."""
     odds = odds or Odds()
     effects = considered(poses, catalogue)
     rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
@@ -227,14 +231,17 @@ def posterior_of(
     suspects: list[int] | None = None
     done = 0
 
-    def told(share: float) -> None:
+    def report(share: float) -> None:
         progress(Stage.EFFECTS, (done + share) / ROUNDS)
 
     while True:
-        told(0.0)
+        report(0.0)
+        # Terms, their evidence, and the likely sets about the present point.
         evidence = Evidence(rows, terms_of(rows, effects, odds, finer, near), odds, suspects)
-        posterior = Posterior(evidence, likely_sets(evidence, told))
+        posterior = Posterior(evidence, likely_sets(evidence, report))
         done += 1
+        # Next point, finer shapes, change points and suspects; stop when nothing
+        # changes.
         point, split = _point_of(posterior), finer_shapes(posterior)
         seen, near = near, coarse_change_point(posterior, near)
         asked, suspects = suspects, _suspects(posterior) if suspects is None else suspects
@@ -245,17 +252,16 @@ def posterior_of(
 
 
 def _suspects(posterior: Posterior) -> list[int] | None:
-    """Poses that are outliers, or none of them where another unit is likely:
-    then something that acts there alone is an alternative, which is asked about
-    no sooner. None where neither is likely."""
+    """Possible outliers, or no pose (an empty list) where another unit is likely:
+    then local parts are competing models. None where neither is likely."""
     outliers, least = posterior.outlier_probabilities, posterior.evidence.odds.reported
     found = [i for i, p in enumerate(outliers) if reaches(p, least)]
     return found if found or reaches(posterior.change_point_probabilities.sum(), least) else None
 
 
 def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:
-    """How many poses are before the likeliest change, if one is likely and not
-    all poses about it are looked at; else the one that was ``near`` before."""
+    """Number of poses before the likeliest change point, if one is likely and its
+    neighbours are not all in the grid; else the previous ``near``."""
     rows, p = posterior.evidence.rows, posterior.change_point_probabilities
     if not reaches(p.sum(), posterior.evidence.odds.reported):
         return near
@@ -265,12 +271,12 @@ def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:
 
 
 def finer_shapes(posterior: Posterior) -> Finer:
-    """Where two neighbouring values of a shape hold nearly all of the
-    probability of a likely effect, what to divide each into: where the effect
-    is strong, the values of the grid are further apart than the poses tell
-    them."""
+    """The divisions of shapes: where two neighbouring values of a shape hold nearly
+    all probability of a likely effect, the grid is coarser than the resolution of the
+    poses."""
     out: dict[Variant, Sequence[Effect]] = {}
     terms, odds = posterior.evidence.terms, posterior.evidence.odds
+    # Group the terms of each likely effect by form, then by variant.
     for name in (name for name, p in posterior.effect_probabilities.items() if reaches(p, odds.reported)):
         forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
         for i, term in enumerate(terms):
@@ -287,17 +293,20 @@ def finer_shapes(posterior: Posterior) -> Finer:
 
 
 def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
-    """By the probability of each variant of one form of an effect, whose shape
-    is one number."""
+    """The division of the variants of one form, with a one-number shape, by their
+    probabilities."""
     if len(of_shapes) < 2:
         return {}
     (shape,) = of_shapes[0][0].shape
     ascending = sorted(of_shapes, key=lambda one: one[0].shape[shape][0])
     value = np.array([effect.shape[shape][0] for effect, _ in ascending])
     share = np.array([p for _, p in ascending])
+    # The pair of neighbours with the largest probability.
     first = int(np.argmax(share[1:] + share[:-1]))
     if share[first : first + 2].sum() < odds.refine_share * share.sum():
         return {}
+    # Split the cell of each of the two into equal parts; cells end half-way between
+    # values.
     edges = np.concatenate([[1.5 * value[0] - 0.5 * value[1]], (value[1:] + value[:-1]) / 2, [value[-1]]])
     out: dict[Variant, Sequence[Effect]] = {}
     for k in (first, first + 1):
@@ -313,17 +322,20 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
 
 
 def _point_of(posterior: Posterior) -> State | None:
-    """The parameters of the likeliest model; None where the linearisation holds
-    for them, where that model has no effect, or where it fits no better there
-    than nothing does: so far the linearisation does not reach."""
+    """The parameters of the likeliest model as the next point of linearisation. None
+    where the present linearisation is accurate there, where the model has no effect,
+    or where the exact fit there is no better than without effects."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):
         return None
+    # Coefficients of the likeliest set, and the nine parameters by generalised least
+    # squares.
     scaled = best.coefficients
     inverse = evidence.precision(best.parts[int(np.argmax(best.by_part))])
     left = inverse @ (rows.y - evidence.columns.at(evidence.places(best.members)) @ scaled)
     linear = inverse_of(rows.linear.T @ inverse @ rows.linear) @ (rows.linear.T @ left)
+    # Coefficients of each effect in its own units, and the linear prediction.
     effects, coefficients, predicted = [], [], rows.linear @ linear - rows.y
     ends = np.cumsum([0, *(term.rank for term in terms)])
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
@@ -334,6 +346,7 @@ def _point_of(posterior: Posterior) -> State | None:
             coefficients.append(own)
             predicted = predicted + rows.by_coefficients(term.effect) @ own
     point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
+    # Exact residuals at that point must improve on those of the linear fit.
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a step too far is none
             found = linearise_all(rows.problem, point, jacobian=False)[0] / rows.error
@@ -341,5 +354,7 @@ def _point_of(posterior: Posterior) -> State | None:
                 return None
     except Refused:
         return None
+    # Linearise anew only if prediction and exact residuals differ beyond the nine
+    # parameters.
     curved = rows.beyond_linear(found - predicted)
     return point if curved @ curved > evidence.odds.relinearise_chi2 else None

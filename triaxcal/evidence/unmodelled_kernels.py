@@ -1,9 +1,8 @@
-"""What no name describes: a random function of one kind or another, whose
-covariance is all that is said of it.
+"""Covariances of unmodelled parts: Gaussian processes of several kinds.
 
-Every function of direction is taken less what nine parameters absorb of it over
-the sphere, not at the poses: these would take half of it, and the linear part
-would come out two or three times worse.
+Every function of direction is projected off the nine parameters over the sphere, not
+at the poses: these would absorb half of it, and the linear part would come out two or
+three times worse.
 """
 
 from __future__ import annotations
@@ -24,23 +23,25 @@ from triaxcal.evidence.row_covariance import LowRank, OwnVariances
 from triaxcal.model.directions import spiral
 
 SPHERE = 300
-"""Directions over which the nine parameters absorb what they can."""
+"""Number of directions of the projection off the nine parameters."""
 SOME = 60
-"""Of these, over which the mean variance of a function is reckoned."""
+"""Number of these directions over which the mean variance of a function is
+computed."""
 SMOOTH = (0.4, 0.8)
-"""Correlation lengths on the sphere, of unit radius: bumps of a face's size,
-and of a hemisphere's."""
+"""Correlation lengths on the unit sphere: features of the size of a face, and of a
+hemisphere."""
 BY_AXIS = 0.3
-"""Of the reference vector, along the reading of an axis: a function of that
-reading alone, odd or even."""
+"""Correlation length, in the reference vector, of an odd or even function of the
+reading of one axis."""
 MEMORY = 0.8
-"""Of the reference vector, by the pose before."""
+"""Correlation length, in the reference vector, for the previous pose."""
 IN_TIME = (0.1, 0.3)
-"""Of the recording's duration."""
+"""Correlation lengths as shares of the recording's duration."""
 KNEES = (0.7, 0.8, 0.9)
-"""Of the reference vector: where what acts near one end of an axis begins."""
+"""Readings, in the reference vector, at which a deviation near one end of an axis
+begins."""
 NEAR = 0.3
-"""On the sphere, of unit radius: how far what acts in one direction reaches."""
+"""Reach of a local part on the unit sphere."""
 ABSORBED = 1e-9
 """A kind is dropped if projection off the nine parameters leaves less than this
 share of its covariance. An example is time, where the times of the poses are
@@ -48,11 +49,11 @@ unknown."""
 
 
 BLOCK = 32
-"""Poses at a time whose covariance is decomposed."""
+"""Number of poses whose covariance is decomposed at a time."""
 
 
 class UnmodelledKind(StrEnum):
-    """What an unmodelled part goes with."""
+    """The variable of an unmodelled part."""
 
     EACH_POSE = "each_pose"
     DIRECTION = "direction"
@@ -61,22 +62,22 @@ class UnmodelledKind(StrEnum):
     POSE_BEFORE = "pose_before"
     TIME = "time"
     LOCAL = "local"
-    """Near one end of an axis, or in one direction: a few poses that share it
-    alone show it."""
+    """Near one end of an axis, or in one direction: only the few poses there show
+    it."""
     WITHIN_POSE = "inside_poses"
-    """The slopes alone, as by noise of a logged channel."""
+    """In the slopes alone, for instance from noise of a logged channel."""
 
 
 OWN = (UnmodelledKind.EACH_POSE, UnmodelledKind.WITHIN_POSE)
-"""What each row has by itself."""
+"""Independent from row to row."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReadingGeometry:
-    """k readings: ``up`` (k,3) unit vectors, ``by_bias`` (k,3) derivatives of
-    |a| by the bias of each axis, ``along`` (k,3) the readings along the
-    sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters, in
-    the scale of `LinearisedData.linear`."""
+    """k readings: ``up`` (k,3) unit vectors, ``by_bias`` (k,3) derivatives of |a| by
+    the bias of each axis, ``along`` (k,3) readings along the sensitive axes in g,
+    ``linear`` (k,9) derivatives by the nine parameters, in the scale of
+    `LinearisedData.linear`."""
 
     up: Floats
     by_bias: Floats
@@ -90,10 +91,10 @@ class ReadingGeometry:
 
 @dataclass(frozen=True, eq=False)
 class PoseInputs:
-    """k poses as a covariance sees them, taken or to come:
-    ``reading_geometry``, the specific force in the pose ``before`` (k,3) over
-    the reference, ``t_s``, ``duration_s`` and ``run`` (k,); the standard
-    ``error`` of their rows (K,), K = 2 k where these have ``slopes``."""
+    """k poses, taken or planned, as arguments of a covariance: ``reading_geometry``,
+    specific force in the previous pose ``before`` (k,3) over the reference, ``t_s``,
+    ``duration_s`` and ``run`` (k,); the standard ``error`` of their rows (K,), K = 2
+    k where these have ``slopes``."""
 
     reading_geometry: ReadingGeometry
     before: Floats
@@ -127,26 +128,25 @@ class PoseInputs:
         )
 
     def rows_of(self, poses: Ints) -> Ints:
-        """The places of their rows."""
+        """Indices of the rows of some poses."""
         return np.concatenate([poses, poses + self.k]) if self.slopes else poses
 
 
 class _Between(Protocol):
-    """(K,L) covariance of the rows of k poses and of l poses, in units of the
-    reference squared, but for a factor."""
+    """(K,L) covariance of the rows of k and l poses, in units of the reference
+    squared, up to a factor."""
 
     def __call__(self, p: PoseInputs, q: PoseInputs) -> Floats: ...
 
 
 @dataclass(frozen=True, eq=False)
 class UnmodelledCovariance:
-    """A covariance of the rows beside the nine parameters, of which these leave
-    a mean variance of 1 in units of the noise. ``of_rows`` is that of the rows
-    over their errors, and ``between`` what makes it and that of any other
-    poses; every covariance of this kind is to be multiplied by ``scale``.
-    ``length`` is that of its correlation. ``whole`` is the rms of |a| that it
-    makes over the sphere, in the unit of the reference: of poses all over it
-    about their mean noise, of others what they do not show as well."""
+    """A covariance of the rows, scaled to a mean variance of 1, in units of the
+    noise, after projection off the nine parameters. ``of_rows`` is the covariance of
+    the rows over their errors, ``between`` the function behind it; every covariance
+    of this kind is multiplied by ``scale``. ``length`` is the correlation length.
+    ``whole`` is the rms of |a| over the sphere at size one, in the unit of the
+    reference."""
 
     what: UnmodelledKind
     length: float
@@ -156,16 +156,16 @@ class UnmodelledCovariance:
     between: _Between
 
     def covariance_of(self, p: PoseInputs, q: PoseInputs) -> Floats:
-        """(K,L) of the rows of poses, over their errors."""
+        """(K,L) covariance of the rows of two sets of poses, over their errors."""
         return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
 
     def bias_at(self, rows: LinearisedData, t_s: float) -> Floats:
-        """(3,N) covariance of the bias at a moment of the last recording with
-        the rows over their errors, of what goes with time; a length is a share
-        of the recording's duration. The bias itself has the variance
-        ``scale``."""
+        """(3,N) covariance of the bias at a moment of the last recording with the
+        rows over their errors, for a process in time; its length is a share of the
+        recording's duration. The bias itself has the variance ``scale``."""
         length = self.length * duration_of(rows)
         apart = t_s - rows.t_s
+        # Squared-exponential covariance with the means; its derivative with the slopes.
         near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
         both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.duration_s]
         by_bias = reading_geometry(rows, rows.problem.u).by_bias
@@ -173,7 +173,7 @@ class UnmodelledCovariance:
 
 
 def duration_of(rows: LinearisedData) -> float:
-    """Of the longest recording."""
+    """Duration of the longest recording in s."""
     return max(1e-9, *(float(np.ptp(rows.t_s[rows.run == run])) for run in np.unique(rows.run)))
 
 
@@ -183,8 +183,8 @@ def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
 
 
 def local_kinds_of(rows: LinearisedData, suspects: Sequence[int]) -> list[UnmodelledCovariance]:
-    """What acts near an end of an axis, or about the direction of one of the
-    ``suspects``: poses that may be outliers."""
+    """Local parts near an end of an axis, or about the direction of one of the
+    ``suspects``, possible outliers."""
     sphere = _Sphere.of(rows)
     return _whitened(rows, sphere, _local(rows, sphere, suspects))
 
@@ -196,6 +196,7 @@ def _whitened(
     here = PoseInputs.of(rows)
     everywhere = _everywhere(sphere.everywhere, rows.slopes)
     for what, length, between in covariances:
+        # Low-rank factor of the covariance, and what the nine parameters leave of it.
         variances = _variances(between, here)
         of_rows = OwnVariances(variances) if what in OWN else LowRank(_factor(between, here, variances))
         shown = float(of_rows.beyond(rows.basis).sum())
@@ -208,7 +209,7 @@ def _whitened(
 
 
 def _everywhere(geometry: ReadingGeometry, slopes: bool) -> PoseInputs:
-    """Poses all over the sphere, in all else alike."""
+    """Poses over the sphere, equal in all other respects."""
     geometry = geometry.only(evenly_spread(np.arange(len(geometry.up)), SOME))
     k = len(geometry.up)
     nothing, error = np.zeros(k), np.ones(2 * k if slopes else k)
@@ -216,7 +217,7 @@ def _everywhere(geometry: ReadingGeometry, slopes: bool) -> PoseInputs:
 
 
 def _variances(between: _Between, here: PoseInputs) -> Floats:
-    """(N,) of the rows over their errors."""
+    """(N,) variances of the rows over their errors."""
     out = np.empty(len(here.error))
     for first in range(0, here.k, BLOCK):
         some = np.arange(first, min(first + BLOCK, here.k))
@@ -226,20 +227,21 @@ def _variances(between: _Between, here: PoseInputs) -> Floats:
 
 
 def _factor(between: _Between, here: PoseInputs, variances: Floats) -> Floats:
-    """(N,r) whose product with its transpose is the covariance of the rows over
-    their errors, to rounding: by the Cholesky decomposition with pivots, a
-    block of poses at a time (Harbrecht, Peters and Schneider 2012, Appl. Numer.
-    Math. 62:428). Smooth functions have few degrees of freedom, however many
-    poses there are."""
+    """(N,r) factor F with F Fᵀ equal to the covariance of the rows over their errors,
+    within rounding: Cholesky decomposition with pivoting by blocks of poses
+    (Harbrecht, Peters and Schneider 2012, Appl. Numer. Math. 62:428). Smooth
+    functions have few degrees of freedom, whatever the number of poses."""
     factor, left = np.empty((len(variances), 0)), variances
     least = len(variances) * np.finfo(float).eps * float(variances.max(initial=0.0))
     while True:
+        # Pivots: the poses with the largest remaining variance.
         of_poses = left.reshape(-1, here.k).max(axis=0)
         block = np.argsort(-of_poses, kind="stable")[:BLOCK]
         block = block[of_poses[block] > least]
         if not len(block):
             return factor
         own, rows = here.only(block), here.rows_of(block)
+        # Remaining covariance of the block, its principal axes, and new columns of F.
         rest = between(own, here) / own.error[:, None] / here.error - factor[rows] @ factor.T
         value, axes = np.linalg.eigh((rest[:, rows] + rest[:, rows].T) / 2)
         kept = value > least
@@ -277,7 +279,7 @@ def _local(
 
 
 def _same(p: PoseInputs, q: PoseInputs) -> Floats:
-    """(k,l): what is each pose's own is shared with no other pose."""
+    """(k,l) identity: independent from pose to pose."""
     return np.eye(p.k) if p is q else np.zeros((p.k, q.k))
 
 
@@ -307,13 +309,14 @@ def _by_the_pose_before(p: PoseInputs, q: PoseInputs) -> Floats:
 
 
 def _in_time(p: PoseInputs, q: PoseInputs, length: float) -> Floats:
-    """A bias of each axis that wanders smoothly, in each recording anew: one
-    process for means and slopes, or slow drift is paid twice."""
+    """A bias of each axis with a smooth random drift, independent between recordings.
+    Means and slopes follow one process, or slow drift would count twice."""
     apart = p.t_s[:, None] - q.t_s[None]
     together = (p.reading_geometry.by_bias @ q.reading_geometry.by_bias.T) * (p.run[:, None] == q.run)
     near = np.exp(-(apart**2) / 2 / length**2) * together
     if not p.slopes:
         return np.asarray(near)
+    # Covariances with slopes: first and second derivatives of the kernel in time.
     mean_slope = near * apart / length**2 * q.duration_s[None]
     slope_mean = -near * apart / length**2 * p.duration_s[:, None]
     inside = near * (1 / length**2 - apart**2 / length**4) * p.duration_s[:, None] * q.duration_s[None]
@@ -326,8 +329,8 @@ class _Covariance(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Sphere:
-    """Directions all over the sphere, with what takes the nine parameters' part
-    off a function there."""
+    """Directions over the sphere, and the projection of a function there onto the
+    nine parameters."""
 
     everywhere: ReadingGeometry
     fit: Floats
@@ -340,20 +343,23 @@ class _Sphere:
         return cls(everywhere, np.linalg.pinv(everywhere.linear))
 
     def covariance(self, of: _Covariance) -> _Between:
-        """Of a function of direction, less its linear part over the sphere."""
+        """Covariance of a function of direction after projection off its linear part
+        over the sphere."""
         return _LessLinear(self, of, of(self.everywhere, self.everywhere))
 
 
 @dataclass(frozen=True, eq=False)
 class _LessLinear:
-    """A `_Between`; no closure, so that a diagnosis can be pickled. ``inner``
-    is the covariance over the sphere."""
+    """A `_Between`, as a class so that a diagnosis can be pickled. ``inner`` is the
+    covariance over the sphere."""
 
     sphere: _Sphere
     of: _Covariance
     inner: Floats
 
     def __call__(self, p: PoseInputs, q: PoseInputs) -> Floats:
+        # (1 − H) K (1 − H)ᵀ, with H the regression on the nine parameters over the
+        # sphere.
         of, everywhere, fit = self.of, self.sphere.everywhere, self.sphere.fit
         here, there = p.reading_geometry.linear @ fit, q.reading_geometry.linear @ fit
         crossed = of(p.reading_geometry, everywhere) @ there.T
@@ -384,7 +390,7 @@ def _by_axis(p: ReadingGeometry, q: ReadingGeometry, sign: int, length: float) -
 
 
 def _beyond_knees(p: ReadingGeometry, q: ReadingGeometry, axis: int, end: float, reference: float) -> Floats:
-    """A bend of one axis at one end, beyond a knee that nobody knows."""
+    """A deviation of one axis beyond a knee of unknown position near one end."""
     here, there = (end * g.along[:, axis, None] / reference - KNEES for g in (p, q))
     bent = np.maximum(here, 0.0) @ (np.maximum(there, 0.0) / (1 - np.array(KNEES)) ** 2).T
     return np.asarray(np.outer(p.by_bias[:, axis], q.by_bias[:, axis]) * bent)

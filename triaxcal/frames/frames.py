@@ -1,11 +1,11 @@
-"""The frame of a unit's mounting faces: what an ellipsoid leaves open, from
-poses on the faces of a fixture.
+"""The frame of a unit's mounting faces, from poses on the faces of a fixture; the
+ellipsoid does not determine it.
 
-Each unit gives the inward normals of the faces it stood on, in its sensor's
-frame (`triaxcal.frames.standing`). The fixture's faces are the same for all
-units on it, so all their normals together give the faces, up to a rotation of
-the whole, and each unit's rotation against them. That last rotation is a
-convention, the datum: which three of the fixture's errors are zero.
+Each unit gives the inward normals of the faces it stood on, in its sensor's frame
+(`triaxcal.frames.standing`). The fixture's faces are the same for all its units, so
+all normals together give the faces, up to a common rotation, and each unit's rotation
+against them. That last rotation is a convention, the datum: which three of the
+fixture's errors are zero.
 """
 
 from __future__ import annotations
@@ -27,23 +27,22 @@ from triaxcal.frames.standing import Standing, basis_of
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 
 ROUNDS = 8
-"""Steps of Gauss–Newton over small rotations, always all of them. Fewer may
-leave a rest of large angles; more cost time alone."""
+"""Gauss–Newton steps over small rotations, always all of them: enough for large
+angles, at little cost."""
 SINGULAR = 0.05
-"""Faces that connect units give singular values near 1; ones that do not, those
-of the faces' own errors."""
+"""Faces that connect units give singular values near 1; others give those of the
+faces' own errors."""
 
 
 @dataclass(frozen=True)
 class Datum:
-    """Which frame the body's is. ``faces``: none for the least-squares frame,
-    else primary and secondary face.
+    """The definition of the body's frame. ``faces``: none for the least-squares
+    frame, else primary and secondary face.
 
-    Faces are named by their outward normal: ``-Z`` is the one that the fixture
-    stands on with +Z up. The least-squares frame is the one in which the sum of
-    the squared errors of the faces that there are is smallest, all weighing the
-    same. With faces, the primary's normal is the axis of its name, and the
-    secondary's lies in the plane of the two.
+    Faces are named by their outward normal: ``-Z`` is the one on which the fixture
+    stands with +Z up. The least-squares frame minimises the sum of the squared errors
+    of the existing faces, with equal weights. With faces, the primary's normal is the
+    axis of its name, and the secondary's lies in the plane of the two.
     """
 
     faces: tuple[str, str] | None = None
@@ -64,9 +63,8 @@ class Datum:
 class UnitFrame:
     """``rotation`` (3,3) takes vectors of the sensor's frame to the body's.
 
-    ``covariance`` (3,3) rad²: of the small rotation about the body's axes that
-    would take it to the truth; ``dof`` (3,) the effective degrees of freedom
-    behind its diagonal.
+    ``covariance`` (3,3) rad² is that of a small rotation about the body's axes;
+    ``dof`` (3,) the effective degrees of freedom of its diagonal.
     """
 
     standing: Standing
@@ -91,8 +89,8 @@ class UnitFrame:
 
 @dataclass(frozen=True)
 class UnitsDisagree(Caution):
-    """On the fixture's faces, by ``ratio`` times what noise and seating explain
-    (probability ``p``)."""
+    """The units disagree on the fixture's faces, by ``ratio`` times what noise and
+    seating explain (probability ``p``)."""
 
     ratio: float
     p: float
@@ -100,8 +98,8 @@ class UnitsDisagree(Caution):
 
 @dataclass(frozen=True)
 class FacesMissing(Caution):
-    """Nothing stood with these ``faces`` up, and the least-squares frame is
-    that of the others."""
+    """No unit stood with these ``faces`` up; the least-squares frame is that of the
+    others."""
 
     faces: tuple[str, ...]
 
@@ -115,12 +113,11 @@ class FaceFarOff(Caution):
 
 @dataclass(frozen=True)
 class Frames:
-    """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all
-    their rotations.
+    """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all their
+    rotations.
 
-    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on
-    the faces; ``birge_ratio`` ≥ 1 by how much the standard errors were raised
-    for it.
+    ``chi2`` in ``left`` degrees of freedom measures the disagreement of the units on
+    the faces; ``birge_ratio`` ≥ 1 is the factor on the standard errors for it.
     """
 
     datum: Datum
@@ -138,8 +135,8 @@ class Frames:
 
     @property
     def agree(self) -> bool | None:
-        """Whether the units stood on one fixture; None where they have no faces
-        to tell it by."""
+        """Whether the units stood on one fixture; None where they have too few faces
+        for a test."""
         return self.birge_ratio == 1 if self.left else None
 
     def between(self, i: int, j: int) -> tuple[Floats, Floats]:
@@ -157,18 +154,20 @@ class Frames:
 def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Frames:
     """One frame for units that stood on the faces of one fixture.
 
-    Raises Refused where the faces do not connect the units, or the datum's are
-    not among those stood on.
+    Raises InvalidData without a unit, Refused where the faces do not connect the
+    units or the datum's are not among them.
     """
     if not standings:
         raise InvalidData("no unit")
     datum = datum or Datum()
     faces = tuple(label for label in LABELS if any(label in s.faces for s in standings))
     _datum_is_there(datum, faces)
+    # Least squares over rotations and normals; chi-square of the redundancy.
     joint = _Joint(standings, faces, datum).connected().solved()
     n = 3 * len(standings)
     left = sum(2 * len(s.faces) for s in standings) - n - 2 * len(faces) + 3
     p = float(chi2_sf(joint.chi2, left)) if left else 1.0
+    # Birge ratio where the units disagree significantly.
     birge_ratio = float(np.sqrt(joint.chi2 / left)) if p < LACK_OF_FIT else 1.0
     covariance = joint.covariance * birge_ratio**2
     dofs = _dof(joint, standings) if birge_ratio == 1 else [np.full(3, float(left))] * len(standings)
@@ -191,13 +190,12 @@ def _datum_is_there(datum: Datum, faces: Sequence[str]) -> None:
 
 @dataclass
 class _Joint:
-    """Rotations of the units and normals of the faces that fit all observed
-    normals best, under the datum.
+    """Least-squares rotations of the units and normals of the faces from all observed
+    normals, under the datum.
 
-    Unknowns of a step: a small rotation about the body's axes for each unit
-    (3u,), shifts of the normals in two axes each (2f,). The three constraints
-    of the datum take the place of the rotation of the whole, which nothing
-    shows.
+    Unknowns of a step: a small rotation about the body's axes for each unit (3u,),
+    shifts of the normals in two axes each (2f,). The three constraints of the datum
+    fix the common rotation, which is not observable.
     """
 
     standings: Sequence[Standing]
@@ -212,8 +210,8 @@ class _Joint:
         ]
 
     def connected(self) -> _Joint:
-        """Itself; raises Refused where the faces in common leave units free to
-        turn against each other."""
+        """Itself; raises Refused where the common faces leave units free to rotate
+        against each other."""
         n = 3 * len(self.standings)
         self._prepare()
         G = np.concatenate([np.zeros((3, n)), self.constraints()[0]], axis=1)
@@ -227,6 +225,7 @@ class _Joint:
         return self
 
     def solved(self) -> _Joint:
+        # Apply the small rotations and shifts; renormalise the normals.
         for _ in range(ROUNDS):
             step = self._step()
             for i in range(len(self.standings)):
@@ -244,6 +243,7 @@ class _Joint:
     def _step(self) -> Floats:
         self._prepare()
         n, m = 3 * len(self.standings), 2 * len(self.faces)
+        # Normal equations of all units.
         information, right = np.zeros((n + m, n + m)), np.zeros(n + m)
         self.chi2 = 0.0
         self.gains = []
@@ -254,6 +254,7 @@ class _Joint:
             right += J.T @ weight @ y
             self.chi2 += float(y @ weight @ y)
             self.gains.append(J.T @ weight)
+        # Bordered system with the datum's constraints (Lagrange multipliers).
         G, miss = self.constraints()
         G = np.concatenate([np.zeros((3, n)), G], axis=1)
         scale = float(np.trace(information)) / (n + m)
@@ -265,13 +266,15 @@ class _Joint:
         return step
 
     def _observed(self, i: int, standing: Standing) -> tuple[Floats, Floats, Floats]:
-        """Derivatives (2k, 3u+2f), misses (2k,) and their covariance of one
+        """Derivatives (2k, 3u+2f), residuals (2k,) and their covariance for one
         unit's normals, in the body's axes."""
         n = 3 * len(self.standings)
         k = len(standing.faces)
         J, y, turn = np.zeros((2 * k, n + 2 * len(self.faces))), np.zeros(2 * k), np.zeros((2 * k, 2 * k))
         for row, label in enumerate(standing.faces):
             face = self.faces.index(label)
+            # Residual of the rotated normal in the tangent plane of the face; d(R n) =
+            # ω × R n.
             T, seen = self.axes[face], self.rotations[i] @ standing.up[row]
             at = slice(2 * row, 2 * row + 2)
             y[at] = -(T.T @ seen)
@@ -281,8 +284,7 @@ class _Joint:
         return J, y, turn @ standing.covariance @ turn.T
 
     def constraints(self) -> tuple[Floats, Floats]:
-        """(3,2f) derivatives, and misses (3,), of what the datum wants to be
-        zero."""
+        """(3,2f) derivatives, and residuals (3,), of the datum's constraints."""
         G = np.zeros((3, 2 * len(self.faces)))
         if self.datum.faces is None:
             for k in range(len(self.faces)):
@@ -298,8 +300,7 @@ class _Joint:
 
 
 def _dof(joint: _Joint, standings: Sequence[Standing]) -> list[Floats]:
-    """(3,) for each unit by Welch and Satterthwaite's formula (JCGM 100,
-    G.4.1)."""
+    """(3,) for each unit by the Welch–Satterthwaite formula (JCGM 100, G.4.1)."""
     out: list[Floats] = []
     for i in range(len(standings)):
         whole = np.diag(joint.covariance)[3 * i : 3 * i + 3]

@@ -27,8 +27,8 @@ from triaxcal.estimate.calibration import (
     Caution,
     Exclusion,
     FewPoses,
-    HoldsAt,
     PoseResult,
+    ReferenceEpoch,
     Residual,
     pose_results,
     studentized,
@@ -609,7 +609,7 @@ def _concluded(
         dilution=_dilution(s.data.ups),
         birge_ratio=raised,
         dof=float(s.left if raised > 1 or s.estimated else max(s.data.dof, 1.0)),
-        holds_at=HoldsAt.of(poses),
+        holds_at=ReferenceEpoch.of(poses),
     )
     found = AttitudeFit(
         calibration,

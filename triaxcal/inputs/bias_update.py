@@ -29,9 +29,9 @@ from triaxcal.estimate.calibration import (
     Calibration,
     Caution,
     FaultyPosesExcluded,
-    HoldsAt,
     Origin,
     PoseResult,
+    ReferenceEpoch,
     Residual,
     pose_results,
     studentized,
@@ -399,11 +399,11 @@ class _Update:
             g = self.c.reference
             yield BiasMoved(float(np.linalg.norm(shift)) / np.sqrt(3) / g, self.expected / g, p)
 
-    def _holds_at(self) -> HoldsAt | None:
+    def _holds_at(self) -> ReferenceEpoch | None:
         """Effects of time are those of the earlier recording, at its moment;
         without them the biases are the mean over the poses."""
         timed = any({TIME, SINCE_START} & set(effect.needs) for effect, _ in self.c.sensor.effects)
-        return self.c.holds_at if timed else HoldsAt.of(self.poses, Moment.MEAN)
+        return self.c.holds_at if timed else ReferenceEpoch.of(self.poses, Moment.MEAN)
 
 
 def _is_bias(n: int) -> Bools:

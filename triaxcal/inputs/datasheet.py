@@ -17,7 +17,15 @@ import numpy as np
 
 from triaxcal.arrays import Floats, rms
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.calibration import Calibration, Caution, HoldsAt, PoseResult, Residual, pose_results, studentized
+from triaxcal.estimate.calibration import (
+    Calibration,
+    Caution,
+    PoseResult,
+    ReferenceEpoch,
+    Residual,
+    pose_results,
+    studentized,
+)
 from triaxcal.estimate.likelihood import Problem, State, linearise, parameters_by_theta
 from triaxcal.model.directions import dilution, linear_design
 from triaxcal.model.sensor import Sensor
@@ -64,7 +72,7 @@ class Datasheet:
     channel_reference: Mapping[str, float]
     reference: float
     correlation: Floats | None = None
-    holds_at: HoldsAt | None = None
+    holds_at: ReferenceEpoch | None = None
 
     @property
     def moment(self) -> tuple[float, float] | None:

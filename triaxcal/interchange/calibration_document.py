@@ -12,8 +12,8 @@ from triaxcal.estimate.calibration import (
     BiasUpdate,
     Calibration,
     Exclusion,
-    HoldsAt,
     PoseResult,
+    ReferenceEpoch,
     Residual,
     Unmodelled,
 )
@@ -216,7 +216,7 @@ def _unmodelled(part: Unmodelled) -> Document:
     return {"along_g": uncertainty(part.along), "across_g": uncertainty(part.across)}
 
 
-def _holds_at(moment: HoldsAt | None) -> Document | None:
+def _holds_at(moment: ReferenceEpoch | None) -> Document | None:
     if moment is None:
         return None
     clock = {} if moment.time_s == moment.t_s else {"since_middle_s": number(moment.time_s)}

@@ -14,7 +14,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual, Unmodelled
+from triaxcal.estimate.calibration import Calibration, ReferenceEpoch, Residual, Unmodelled
 from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.samples import Moment
@@ -167,7 +167,7 @@ def unmodelled_of(part: Mapping[str, Any], *, where: str) -> Unmodelled | None:
     return Unmodelled(along, across)
 
 
-def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
+def holds_at_of(part: Mapping[str, Any], *, where: str) -> ReferenceEpoch | None:
     """None where the document, as those of 0.1, does not say. Raises
     InvalidData."""
     held = part.get("holds_at")
@@ -180,7 +180,7 @@ def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
         t_s = time_s = math.nan
     if not math.isfinite(t_s + time_s):
         raise InvalidData(f"{where}: holds_at: expected a moment (end, mean or seconds) and t_s in seconds")
-    return HoldsAt(moment, t_s, time_s)
+    return ReferenceEpoch(moment, t_s, time_s)
 
 
 def _residual(part: Mapping[str, Any]) -> Residual:

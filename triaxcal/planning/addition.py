@@ -1,5 +1,4 @@
-"""The next best poses: what poses that are there still lack, what to add, and
-what each addition would do."""
+"""Additional poses: those that a set lacks, and the effect of each addition."""
 
 from __future__ import annotations
 
@@ -31,26 +30,25 @@ from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.design import (
     PLANS_CLOCK,
     VISIBLE,
-    Asked,
     OnPlansClock,
-    ask,
+    TargetEffects,
     channels_needed,
     combinations,
     profile_times,
+    target_effects,
 )
 from triaxcal.planning.optimal import profile
 from triaxcal.poses.covariates import channels_of
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, within_pose_dof
 from triaxcal.poses.pose import Pose
 
-# The noise that a recording predicts: what its poses leave beside the effects that
-# a plan is for.
+# The noise of a recording: residuals of its poses after the effects of the plan.
 
 
 @dataclass(frozen=True, eq=False)
 class Estimable(Effect):
-    """Those combinations ``seen`` (p,q) of the coefficients of ``effects``, all
-    together, that poses can show."""
+    """The combinations ``seen`` (p,q) of the coefficients of all ``effects`` that the
+    poses can show, as one effect."""
 
     effects: tuple[Effect, ...]
     seen: Floats = field(repr=False)
@@ -72,25 +70,26 @@ class Estimable(Effect):
         return np.concatenate([e.slope(s, covariates) for e in self.effects], axis=-1) @ self.seen
 
 
-def fitted_beside(
+def fit_with_estimable(
     poses: Sequence[Pose], effects: Sequence[Effect], *, signs: Sequence[float], reference: float
 ) -> Calibration:
-    """The fit of the linear model with what the poses can show of ``effects``
-    beside it, so that this is no misfit.
+    """The fit of the linear model together with the estimable combinations of
+    ``effects``, so that these do not count as misfit.
 
-    An effect of a plan's clock has the shape that the poses show best. Raises
-    Refused as `fit` does; InvalidData where a channel that an effect needs is
-    not there.
+    An effect of a plan's clock has the shape with the best fit. Raises Refused as
+    `fit`; InvalidData where a channel that an effect needs is missing.
     """
     sound = [p for p in poses if not p.fault]
     linear = fit(sound, signs=signs, reference=reference)
     if not effects:
         return linear
+    # Linearise about the linear fit, with the best shape of each effect.
     problem, begin = started_problem(sound, signs=signs, reference=reference, effects=effects)
     state = solve(problem, begin, ())
     chosen = tuple(_shaped(problem, state, e) for e in effects)
     _, J, s = linearise(problem, state.extended(chosen))
     weighted = J / s[:, None]
+    # Fit the combinations that remain visible next to the nine parameters.
     seen, _ = combinations(weighted[:, :LINEAR], weighted[:, LINEAR:], VISIBLE)
     if not seen.shape[1]:
         return linear
@@ -108,12 +107,12 @@ def _shaped(problem: Problem, state: State, effect: Effect) -> Effect:
 
 
 def noise_of(calibration: Calibration) -> Floats | None:
-    """(n,) standard errors of the poses used, as poses to come will have them,
-    in the unit of the reference; None where nothing tells them.
+    """(n,) standard errors of the poses used, as expected for poses to come, in the
+    unit of the reference; None where unknown.
 
-    The noise inside the poses with the excess variance, and with a Birge ratio
-    only where residuals are significantly more than noise: to raise it for less
-    would on average promise too much, as no factor ever lowers it.
+    Noise inside the poses with the excess variance, and with a Birge ratio only where
+    residuals exceed the noise significantly: since no factor ever lowers the noise,
+    raising it for less would be biased.
     """
     used = [p for p in calibration.poses if p.used]
     error = np.array([p.error_g for p in used])
@@ -125,20 +124,18 @@ def noise_of(calibration: Calibration) -> Floats | None:
 
 
 ENOUGH = 1.25
-"""A set is good whose worst parameter is no more uncertain than this many
-poses' standard errors (the 14 have 1.06 where all are alike), and whose effects
-come out no more than so many times worse than from the plan of 26."""
+"""Limit of the worst parameter in standard errors of a pose (the 14 poses have 1.06
+with equal noise), and of the errors of effects relative to the plan of 26."""
 MOST = FULL
-"""No more are added than a whole plan has: that would be the better one to
-take."""
+"""Largest number of additions: a whole plan would be better than more."""
 
 
 @dataclass(frozen=True)
-class Had:
-    """The poses that are there. ``up`` (n,3); ``weights`` (n,) 1/variance, of a
-    typical pose 1; ``held`` by channel and time (n,), each from −1 to 1 over
-    what it went through, of which ``half`` is the half in the channel's unit;
-    ``axes`` (3,3) the sensitive axes, in rows."""
+class ExistingPoses:
+    """The existing poses. ``up`` (n,3); ``weights`` (n,) 1/variance, 1 for a typical
+    pose; ``held`` by channel and time (n,), each from −1 to 1 over its range, of
+    which ``half`` is the half in the channel's unit; ``axes`` (3,3) the sensitive
+    axes, in rows."""
 
     up: Floats
     weights: Floats
@@ -148,17 +145,17 @@ class Had:
 
     @property
     def worst_error(self) -> float:
-        """Of the nine parameters, in standard errors of a typical pose
+        """Worst error of the nine parameters in standard errors of a typical pose
         (`worst_error`)."""
         return worst_error(linear_design(self.up, self.up) * np.sqrt(self.weights)[:, None])
 
 
 @dataclass(frozen=True)
 class Addition:
-    """One pose more. ``levels`` of the channels, −1 lowest to 1 highest;
+    """One additional pose. ``levels`` of the channels, −1 lowest to 1 highest;
     ``dilution``, ``worst_error`` of the nine parameters and ``errors``
-    (`Asked.errors`, per unit of the channels) are those of the poses there with
-    this one and all before it."""
+    (`TargetEffects.errors`, per unit of the channels) include this pose and all
+    previous ones."""
 
     label: str
     up: Floats
@@ -168,41 +165,42 @@ class Addition:
     errors: Mapping[str, Mapping[str, float | None]]
 
 
-def additions(had: Had, asked: Asked, first: Sequence[Direction] = ()) -> list[Addition]:
-    """Poses of the 26 worth adding, best first: ``first`` those that the nine
-    parameters want, then those that the effects asked for want, until these
-    come out nearly as well as from a whole plan, or ``MOST`` are added.
+def additions(existing: ExistingPoses, targets: TargetEffects, first: Sequence[Direction] = ()) -> list[Addition]:
+    """Poses of the 26 worth adding, best first: ``first`` those for the nine
+    parameters, then those for the effects, until these are determined nearly as well
+    as by a whole plan, or ``MOST`` are added.
 
-    Each is the one that adds most to the information on what is still wanting.
+    Each pose is the one with the largest information on the missing quantities.
     """
-    return _Adding(had, asked).run(first)
+    return _Adding(existing, targets).run(first)
 
 
 class _Adding:
-    def __init__(self, had: Had, asked: Asked) -> None:
-        self.had, self.asked = had, asked
-        self.channels = channels_needed(asked.effects)
-        self.step = 2 / max(len(had.up) - 1, 1)
-        self.rows = asked.rows(had.up, had.held)
-        self.scaled = asked.rows(had.up, self._in_units(had.held))
-        self.weights = had.weights
+    def __init__(self, existing: ExistingPoses, targets: TargetEffects) -> None:
+        self.existing, self.targets = existing, targets
+        self.channels = channels_needed(targets.effects)
+        self.step = 2 / max(len(existing.up) - 1, 1)
+        self.rows = targets.rows(existing.up, existing.held)
+        self.scaled = targets.rows(existing.up, self._in_units(existing.held))
+        self.weights = existing.weights
         self.out: list[Addition] = []
 
     def run(self, first: Sequence[Direction]) -> list[Addition]:
         for direction in first:
             self._add([direction])
-        limit = _as_a_whole_plan(self.asked)
-        while self.asked.rank and len(self.out) < MOST and not self._enough(limit):
+        limit = _as_a_whole_plan(self.targets)
+        while self.targets.rank and len(self.out) < MOST and not self._enough(limit):
             self._add(cube_directions())
         return self.out
 
     def _enough(self, limit: float) -> bool:
         _, singular, _ = np.linalg.svd(self.rows * np.sqrt(self.weights)[:, None])
         whole = len(self.rows) >= self.rows.shape[1] and singular[-1] > 1e-6 * singular[0]
-        return bool(whole and self.asked.worst(self.rows, self.weights) <= limit)
+        return bool(whole and self.targets.worst(self.rows, self.weights) <= limit)
 
     def _add(self, choice: Sequence[Direction]) -> None:
-        """The best of these directions, at the best levels."""
+        """Add the best of these directions at the best levels."""
+        # All levels of the channels in all directions, at the next time.
         combined = list(itertools.product((-1.0, 0.0, 1.0), repeat=len(self.channels)))
         options = [(d, dict(zip(self.channels, at, strict=True))) for at in combined for d in choice]
         ups = np.array([v for (_, v), _ in options])
@@ -210,46 +208,48 @@ class _Adding:
         held = {clock: np.full(len(options), time) for clock in (TIME, PLANS_CLOCK)} | {
             c: np.array([levels[c] for _, levels in options]) for c in self.channels
         }
-        rows = self.asked.rows(ups, held)
+        # The largest gain in information; ties go to the first.
+        rows = self.targets.rows(ups, held)
         gain = self._gain(rows)
         at = int(np.argmax(gain >= gain.max() - 1e-6))
         (label, up), levels = options[at]
         self.rows = np.concatenate([self.rows, rows[at : at + 1]])
         self.weights = np.append(self.weights, 1.0)
         linear = self.rows[:, :LINEAR] * np.sqrt(self.weights)[:, None]
-        scaled = self.asked.rows(ups[at : at + 1], {n: v[at : at + 1] for n, v in self._in_units(held).items()})
+        scaled = self.targets.rows(ups[at : at + 1], {n: v[at : at + 1] for n, v in self._in_units(held).items()})
         self.scaled = np.concatenate([self.scaled, scaled])
-        errors = self.asked.errors(self.scaled, self.weights)
-        ups = np.concatenate([self.had.up, *(a.up[None] for a in self.out), up[None]])
-        spread = dilution(ups, linear_design(ups, in_range(ups @ self.had.axes.T)))
+        # Errors of all parameters with the pose added.
+        errors = self.targets.errors(self.scaled, self.weights)
+        ups = np.concatenate([self.existing.up, *(a.up[None] for a in self.out), up[None]])
+        spread = dilution(ups, linear_design(ups, in_range(ups @ self.existing.axes.T)))
         self.out.append(Addition(label, up, levels, spread, worst_error(linear), errors))
 
     def _in_units(self, held: Mapping[str, Floats]) -> dict[str, Floats]:
-        return {name: v * self.had.half.get(name, 1.0) for name, v in held.items()}
+        return {name: v * self.existing.half.get(name, 1.0) for name, v in held.items()}
 
     def _gain(self, rows: Floats) -> Floats:
-        """(C,) log of what each row multiplies the determinant of the effects'
-        information by."""
+        """(C,) log factor of the determinant of the effects' information by each row:
+        ln(1 + x'M⁻¹x) − ln(1 + x₁'M₁₁⁻¹x₁)."""
         M = (self.rows * self.weights[:, None]).T @ self.rows + 1e-9 * np.eye(rows.shape[1])
         whole = np.einsum("ci,ij,cj->c", rows, np.linalg.inv(M), rows)
         linear = rows[:, :LINEAR]
         part = np.einsum("ci,ij,cj->c", linear, np.linalg.inv(M[:LINEAR, :LINEAR]), linear)
-        return np.asarray(np.log1p(whole) - (np.log1p(part) if self.asked.rank else 0.0))
+        return np.asarray(np.log1p(whole) - (np.log1p(part) if self.targets.rank else 0.0))
 
 
-def _as_a_whole_plan(asked: Asked) -> float:
-    """The worst standard error that the combinations of the effects'
-    coefficients may have."""
+def _as_a_whole_plan(targets: TargetEffects) -> float:
+    """Largest allowed standard error of the combinations of coefficients, from a
+    whole plan."""
     ups = np.array([v for _, v in directions(FULL)])
     ups = np.concatenate([ups, ups[:1]])
-    held = {TIME: profile_times(len(ups))} | profile(channels_needed(asked.effects), len(ups), 3)
-    return ENOUGH * asked.worst(asked.rows(ups, held))
+    held = {TIME: profile_times(len(ups))} | profile(channels_needed(targets.effects), len(ups), 3)
+    return ENOUGH * targets.worst(targets.rows(ups, held))
 
 
 @dataclass(frozen=True)
 class ChannelRange:
-    """From where to where a channel moved in a recording: both None where the
-    recording has no such channel, both the same where it stood still."""
+    """Range of a channel in a recording: both None where the recording lacks it, both
+    equal where it was static."""
 
     lowest: float | None = None
     highest: float | None = None
@@ -257,14 +257,14 @@ class ChannelRange:
 
 @dataclass(frozen=True)
 class MissingPoses:
-    """``had`` are the poses that carry a fit, None where they do not, and
-    ``dilution`` that of the linear fit to them; ``wanted`` the poses to add;
-    ``noise`` the standard error of a typical pose beside the effects, in parts
-    of the reference; ``now`` the effects' standard errors without the poses to
-    add, in that unit; ``absent`` the channels that the recording has not;
-    ``moves`` how far the channels that have to move did."""
+    """``existing`` are the poses that carry a fit, None where they do not, ``dilution``
+    that of the linear fit; ``wanted`` the additional poses; ``noise`` the standard
+    error of a typical pose after the effects, relative to the reference; ``now`` the
+    effects' standard errors without the additions, in that unit; ``absent`` the
+    channels that the recording lacks; ``moves`` the ranges of the channels that have
+    to change."""
 
-    had: Had | None
+    existing: ExistingPoses | None
     dilution: float | None
     wanted: list[Addition]
     noise: float | None
@@ -282,38 +282,45 @@ def missing_poses(
     absent = [c for c in channels_needed(asked_for) if c not in logged or not np.isfinite(logged[c]).all()]
     moves = dict.fromkeys(absent, ChannelRange())
     there = [e for e in asked_for if not set(e.needs) & set(absent)]
-    asked = ask(there)
-    if asked_for and not absent and asked.rank == 0:
+    targets = target_effects(there)
+    if asked_for and not absent and targets.rank == 0:
         raise Refused(f"|a| shows nothing of {', '.join(e.name for e in effects)} beside the nine parameters")
     try:
         linear = fit(poses, signs=signs, reference=reference)
     except Refused as e:
         where = dict(cube_directions())
         up, _ = rough_directions(poses, signs)
-        had = _had(up, np.ones(len(up)), poses if len(up) else [], moves, channels_needed(asked.effects))
+        existing = _existing(up, np.ones(len(up)), poses if len(up) else [], moves, channels_needed(targets.effects))
         labels = e.wanted or wanted_for(poses, signs)
-        wanted = additions(had, asked, [(label, where[label]) for label in labels])
+        wanted = additions(existing, targets, [(label, where[label]) for label in labels])
         return MissingPoses(None, None, wanted, None, {}, tuple(absent), moves)
-    beside = fitted_beside(poses, there, signs=signs, reference=reference) if there else linear
-    had, noise = _had_of(beside, moves, channels_needed(asked.effects))
-    first = most_wanted(had.up, enough=ENOUGH, most=FULL, weights=had.weights)
-    now = asked.errors(asked.rows(had.up, {n: v * had.half.get(n, 1.0) for n, v in had.held.items()}), had.weights)
-    return MissingPoses(had, linear.dilution, additions(had, asked, first), noise, now, tuple(absent), moves)
+    extended = fit_with_estimable(poses, there, signs=signs, reference=reference) if there else linear
+    existing, noise = _existing_of(extended, moves, channels_needed(targets.effects))
+    first = most_wanted(existing.up, enough=ENOUGH, most=FULL, weights=existing.weights)
+    now = targets.errors(
+        targets.rows(existing.up, {n: v * existing.half.get(n, 1.0) for n, v in existing.held.items()}),
+        existing.weights,
+    )
+    return MissingPoses(
+        existing, linear.dilution, additions(existing, targets, first), noise, now, tuple(absent), moves
+    )
 
 
-def _had_of(c: Calibration, moves: dict[str, ChannelRange], channels: Sequence[str]) -> tuple[Had, float | None]:
+def _existing_of(
+    c: Calibration, moves: dict[str, ChannelRange], channels: Sequence[str]
+) -> tuple[ExistingPoses, float | None]:
     used = [p for p in c.poses if p.used]
     error = noise_of(c)
     typical = None if error is None else float(np.sqrt(np.median(error**2)))
     weights = np.ones(len(used)) if error is None or typical is None else (typical / error) ** 2
     up = np.array([p.direction for p in used])
-    had = _had(up, weights, [p.pose for p in used], moves, channels)
-    return replace(had, axes=c.sensor.axes), None if typical is None else typical / c.reference
+    existing = _existing(up, weights, [p.pose for p in used], moves, channels)
+    return replace(existing, axes=c.sensor.axes), None if typical is None else typical / c.reference
 
 
-def _had(
+def _existing(
     up: Floats, weights: Floats, poses: Sequence[Pose], moves: dict[str, ChannelRange], channels: Sequence[str]
-) -> Had:
+) -> ExistingPoses:
     """Adds to ``moves`` the channels that stood still."""
     held: dict[str, Floats] = {c: np.zeros(len(up)) for c in channels} | {TIME: profile_times(len(up))}
     half = dict.fromkeys((*channels, TIME), 1.0)
@@ -326,4 +333,4 @@ def _had(
                 moves[name] = ChannelRange(float(values.min()), float(values.max()))
         elif name in channels:
             moves[name] = ChannelRange(float(values[0]), float(values[0]))
-    return Had(up, weights, held | {PLANS_CLOCK: held[TIME]}, half)
+    return ExistingPoses(up, weights, held | {PLANS_CLOCK: held[TIME]}, half)

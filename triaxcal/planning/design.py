@@ -1,5 +1,5 @@
-"""What poses in given directions and covariates tell of effects: the columns of
-a plan's design, by |a| alone."""
+"""Information of poses in given directions and covariates on effects: the columns of
+a design, by |a| alone."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from triaxcal.model.directions import FULL, linear_design
 from triaxcal.model.sensor import LINEAR
 
 SHOWS = 1e-6
-"""A combination of coefficients shows at all where this share of it is left
-beside the nine parameters."""
+"""Least share of a combination of coefficients, after projection off the nine
+parameters, that counts as observable."""
 VISIBLE = 0.02
-"""What shows of an effect, or of a coefficient, can be used where at least this
-share of it is left beside all else. What is less comes of directions that are a
-degree off."""
+"""Least share, after projection off all else, that is usable. Less is of the size of
+direction errors of a degree."""
 
 
 def channels_needed(effects: Sequence[Effect]) -> tuple[str, ...]:
-    """The channels that the effects depend on, time left out, each once."""
+    """The channels on which the effects depend, without time, each once."""
     return tuple(dict.fromkeys(n for e in effects for n in e.needs if n != TIME))
 
 
@@ -40,17 +39,17 @@ def profile_times(n: int) -> Floats:
 
 
 def radial(effects: Sequence[Effect], a: Floats, held: Mapping[str, Floats]) -> Floats:
-    """(n,p): what a unit of each coefficient adds to |a| of an ideal triad,
-    ``a`` (n,3) unit vectors."""
+    """(n,p) derivative of |a| of an ideal triad by each coefficient, ``a`` (n,3) unit
+    vectors."""
     columns = [np.einsum("ni,nip->np", a, e.basis(a, held)) for e in effects]
     return np.concatenate(columns, axis=1) if columns else np.empty((len(a), 0))
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Effects that a plan is for. ``seen`` (p,q): orthonormal combinations of
-    their coefficients that |a| can show beside the nine parameters, ``hidden``
-    (p,p−q) those that no plan can, since they look like others of them."""
+class TargetEffects:
+    """Target effects of a plan. ``seen`` (p,q): orthonormal combinations of their
+    coefficients that |a| can show in addition to the nine parameters, ``hidden``
+    (p,p−q) those that no plan can show, since they are equivalent to others."""
 
     effects: tuple[Effect, ...]
     seen: Floats
@@ -61,19 +60,20 @@ class Asked:
         return int(self.seen.shape[1])
 
     def rows(self, a: Floats, held: Mapping[str, Floats]) -> Floats:
-        """(n,9+q): derivatives of |a| by the nine parameters and by the
-        combinations that show."""
+        """(n,9+q): derivatives of |a| by the nine parameters and by the observable
+        combinations."""
         return np.concatenate([linear_design(a, a), radial(self.effects, a, held) @ self.seen], axis=1)
 
     def errors(self, rows: Floats, weights: Floats | None = None) -> dict[str, dict[str, float | None]]:
-        """Standard error of each coefficient by effect, in standard errors of
-        one pose, fitted all together.
+        """Standard error of each coefficient by effect, in standard errors of one
+        pose, all fitted together.
 
-        None where the poses (``rows`` (n,9+q), each with its weight) cannot
-        show that coefficient by itself: less than `VISIBLE` of what it makes is
-        left beside the other parameters.
+        None where the poses (``rows`` (n,9+q), each with its weight) cannot show that
+        coefficient by itself: less than `VISIBLE` of its contribution is left after
+        projection off the other parameters.
         """
         loose, spread = self._spread(rows, weights)
+        # Coefficients outside the hidden and the undetermined combinations.
         alone = np.linalg.norm(self.hidden, axis=1) < 1e-6
         known = alone & (np.abs(self.seen @ loose).max(axis=1, initial=0.0) < 1e-6)
         errors = np.linalg.norm(self.seen @ spread, axis=1)
@@ -81,6 +81,8 @@ class Asked:
         # Of a coefficient alone; the columns of what is hidden are those of
         # others.
         whole = np.linalg.norm(rows[:, LINEAR:] @ self.seen.T * np.sqrt(w)[:, None], axis=0)
+        # Remaining share of each coefficient: 1 / (standard error × norm of its
+        # column).
         known &= errors * whole * VISIBLE <= 1
         out: dict[str, dict[str, float | None]] = {}
         at = 0
@@ -92,18 +94,19 @@ class Asked:
         return out
 
     def worst(self, rows: Floats, weights: Floats | None = None) -> float:
-        """The largest standard error of the combinations that can show;
-        infinite where the poses do not show one."""
+        """Largest standard error of the observable combinations; infinite where the
+        poses do not determine one."""
         loose, spread = self._spread(rows, weights)
         known = np.abs(loose).max(axis=1, initial=0.0) < 1e-6
         return float(np.linalg.norm(spread, axis=1).max(initial=0.0)) if known.all() else float("inf")
 
     def _spread(self, rows: Floats, weights: Floats | None) -> tuple[Floats, Floats]:
-        """Of the combinations that can show, (q,·) each: what of them the poses
-        do not determine, and the spread of what they do."""
+        """For the observable combinations, (q,·) each: the undetermined directions,
+        and a square root of the covariance of the rest."""
         w = np.ones(len(rows)) if weights is None else weights
         size = np.linalg.norm(rows, axis=0)
         size = np.where(size > 0, size, 1.0)
+        # SVD with columns of length one.
         _, singular, v = np.linalg.svd(rows * np.sqrt(w)[:, None] / size, full_matrices=True)
         values = np.zeros(rows.shape[1])
         values[: len(singular)] = singular
@@ -112,57 +115,58 @@ class Asked:
         return combined[bad].T[LINEAR:], (combined[~bad].T / values[~bad])[LINEAR:]
 
 
-def ask(effects: Sequence[Effect]) -> Asked:
-    """What of the effects, taken together, |a| can show, were directions and
-    covariates free."""
+def target_effects(effects: Sequence[Effect]) -> TargetEffects:
+    """The observable combinations of the effects, for free directions and
+    covariates."""
+    # Random directions and covariates, many enough for any effect.
     rng = np.random.default_rng(0)
     a = rng.standard_normal((1500, 3))
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     held = {n: rng.uniform(-1, 1, len(a)) for n in (TIME, *channels_needed(effects))}
     seen, hidden = combinations(linear_design(a, a), radial(effects, a, held))
-    return Asked(tuple(effects), seen, hidden)
+    return TargetEffects(tuple(effects), seen, hidden)
 
 
 def combinations(nuisance: Floats, columns: Floats, least: float = SHOWS) -> tuple[Floats, Floats]:
-    """Orthonormal combinations (p,q) of columns (n,p) that show beside the
-    nuisance (n,k), and (p,p−q) that do not.
+    """Orthonormal combinations (p,q) of columns (n,p) that are observable in addition
+    to the nuisance (n,k), and (p,p−q) that are not.
 
-    A combination shows where at least the share ``least`` of it is left after
-    projection, the columns scaled alike.
+    A combination is observable where at least the share ``least`` of it is left after
+    projection, with columns of equal length.
     """
     size = np.linalg.norm(columns, axis=0)
     there = size > 1e-9
     scale = np.where(there, size, 1.0)
     norms = np.maximum(np.linalg.norm(nuisance, axis=0), 1e-300)
+    # Project the columns off the nuisance, then split by singular values.
     rest = columns / scale - nuisance / norms @ np.linalg.lstsq(nuisance / norms, columns / scale, rcond=1e-12)[0]
     rest[:, ~there] = 0.0
     _, singular, rows = np.linalg.svd(rest, full_matrices=True)
     kept = np.zeros(columns.shape[1], dtype=bool)
     kept[: len(singular)] = singular > least
-    # Coefficients of what does not show; what shows is whatever is at right
-    # angles to it.
+    # Null space in the coefficients, and its orthogonal complement.
     hidden = np.linalg.qr(rows[~kept].T / scale[:, None])[0] if not kept.all() else np.empty((len(size), 0))
     basis = np.linalg.svd(hidden, full_matrices=True)[0] if hidden.size else np.eye(len(size))
     return np.asarray(basis[:, hidden.shape[1] :]), np.asarray(hidden)
 
 
-# Effects of the recording's clock as a plan sees them, whose time runs from −1, the
-# first pose, to 1, the last.
+# Effects of the recording's clock in a plan, whose time runs from −1, the first pose,
+# to 1, the last.
 
 PLANS_CLOCK = "plans_clock"
-"""`TIME` from −1 to 1, where that itself is in seconds."""
+"""`TIME` from −1 to 1, where `TIME` itself is in seconds."""
 POSES = FULL + 1
-"""Of the plan that shapes are chosen for: the one of 26, its first pose
+"""Poses of the plan for which shapes are chosen: the one of 26, its first pose
 repeated."""
 HELD_SHARE = 0.01
-"""How long a pose is held, where the plan is two long: an eighth of the time
-from pose to pose, so that a step falls between poses as a rule."""
+"""Duration of a pose in a plan of length two: an eighth of the time from pose to
+pose, so that a step usually falls between poses."""
 
 
 @dataclass(frozen=True)
 class OnPlansClock(Wrapped):
-    """``whole`` with a shape that suits a recording two units long, by
-    `PLANS_CLOCK`, or `TIME` where that is one."""
+    """``whole`` with a shape for a recording two units long, by `PLANS_CLOCK`, or
+    `TIME` where that is one."""
 
     needs: tuple[str, ...] = (TIME,)
 
@@ -174,8 +178,7 @@ class OnPlansClock(Wrapped):
 
 
 def in_plan(effect: Effect) -> Effect:
-    """The effect as a plan can show it: of a time constant or a moment, the
-    middle one that would be tried."""
+    """The effect in a plan; the middle variant of a time constant or a moment."""
     if not of_clocks(effect) or effect.needs == (TIME,):
         return effect
     variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))
@@ -190,17 +193,16 @@ def _clocks(time: Floats) -> dict[str, Floats]:
     return {TIME: time, SINCE_START: time + 1, DURATION: np.full(len(time), HELD_SHARE)}
 
 
-# What a set of poses can show of an effect: the part of it that the model cannot
-# absorb.
+# The observability of an effect by a set of poses.
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What a plan shows of one effect: ``visible`` of its ``of`` independent
+class Observability:
+    """Observability of one effect by a plan: ``visible`` of its ``of`` independent
     coefficients.
 
-    ``hidden`` are the combinations of coefficients that do not show, name →
-    weight, unit vectors.
+    ``hidden`` are the combinations of coefficients that do not show, name → weight,
+    unit vectors.
     """
 
     visible: int
@@ -208,11 +210,11 @@ class Sight:
     hidden: tuple[Mapping[str, float], ...]
 
 
-def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Sight:
-    """What poses in these directions (n,3), in this order and evenly in time,
-    show of an effect by itself.
+def observability(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Observability:
+    """Observability of a single effect by poses in these directions (n,3), in this
+    order and evenly in time.
 
-    Every channel is taken to move freely, but for those ``held`` (n,).
+    Every channel varies freely, except for those ``held`` (n,).
     """
     n, effect = len(directions), in_plan(effect)
     rng = np.random.default_rng(0)
@@ -223,14 +225,15 @@ def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None 
     )
     names = [c.name for c in effect.coefficients]
     named = tuple({k: float(w) for k, w in zip(names, v, strict=True) if abs(w) > 1e-9} for v in _plainly(hidden.T))
-    return Sight(seen.shape[1], len(names), named)
+    return Observability(seen.shape[1], len(names), named)
 
 
 def _plainly(hidden: Floats) -> Floats:
-    """The same space of combinations (k,p), with as many weights zero as the
-    reduced echelon form has."""
+    """The same space of combinations (k,p) in reduced echelon form, rows of unit
+    length."""
     rows = hidden.copy()
     pivots = 0
+    # Gauss–Jordan elimination with row pivoting.
     for column in range(rows.shape[1]):
         rest = np.abs(rows[pivots:, column])
         if pivots == len(rows) or rest.max(initial=0.0) < 1e-6:
@@ -245,7 +248,7 @@ def _plainly(hidden: Floats) -> Floats:
 
 
 def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
-    """Names of the effects that poses in these directions (n,3) cannot show in
-    full, were every channel moving freely."""
-    sights = [sight(directions, e) for e in catalogue]
-    return [e.name for e, s in zip(catalogue, sights, strict=True) if s.visible < s.of]
+    """Names of the effects that poses in these directions (n,3) cannot show in full,
+    with free channels."""
+    observabilities = [observability(directions, e) for e in catalogue]
+    return [e.name for e, s in zip(catalogue, observabilities, strict=True) if s.visible < s.of]

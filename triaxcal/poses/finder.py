@@ -7,16 +7,16 @@ from typing import Any
 
 from triaxcal.errors import InvalidData, TooShort
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
-from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
+from triaxcal.poses.quality import QualityDetector, QualityFinding, faulty_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector
 from triaxcal.poses.stillness.windows import Windows
 
 
 class PoseFinder:
-    """Finds the still poses of a stream, and what is wrong with its samples.
+    """Finds the still poses of a stream, and faults of its samples.
 
-    The blocks may have any size: the result is that of the whole. ``turn_s`` is
-    how long a turn in place takes, where the unit may turn so, as for
+    The blocks may have any size: the result is that of the whole. ``turn_s`` is the
+    shortest duration of an in-place rotation, where the unit may turn so, as in
     `triaxcal.poses.stillness.find_spans`.
     """
 
@@ -25,23 +25,23 @@ class PoseFinder:
         self._stillness = StillnessDetector()
         self._quality = QualityDetector()
         self._spans: tuple[int, list[Span]] = (0, [])
-        self._findings: list[Finding] | None = None
+        self._findings: list[QualityFinding] | None = None
 
     def feed(self, time_ns: Any, readings: Any, channels: Mapping[str, Any] | None = None) -> None:
-        """Times (n,) in nanoseconds, readings (n,3), and channels (n,) each by
-        name. Raises InvalidData where they are of other shapes, where times do
-        not increase, or where readings are not finite."""
+        """Times (n,) in nanoseconds, readings (n,3) in output units, and channels
+        (n,) by name. Raises InvalidData for other shapes, times that do not increase,
+        or readings that are not finite."""
         self._findings = None
         self._stillness.feed(time_ns, readings, channels or {})
         self._quality.feed(time_ns, readings)
 
     def finish(self) -> None:
-        """No more samples come."""
+        """End of the stream."""
         self._stillness.finish()
         self._quality.finish()
 
     def part_by(self, turn_s: float | None) -> None:
-        """Take the poses apart for another ``turn_s`` from now on."""
+        """Separate the poses with another ``turn_s`` from now on."""
         self._turn_s, self._spans, self._findings = turn_s, (0, []), None
 
     @property
@@ -53,25 +53,24 @@ class PoseFinder:
             return None
 
     def too_short(self) -> TooShort | None:
-        """Why no pose could be found so far, whatever the unit did."""
+        """The reason why no pose can be found so far, or None."""
         return self._stillness.too_short()
 
     def still_spans(self) -> list[StillSpan]:
-        """The poses so far without their noise, which takes longer than all the
-        rest."""
+        """The poses so far without their noise, which takes most of the time."""
         windows = self.windows
         return [] if windows is None else still_spans_of(windows, self.spans())
 
     def poses(self, *, judged: bool = True) -> list[Pose]:
-        """The poses so far. Those whose samples are faulty name the fault, and
-        tell nothing of the noise of the others, unless ``judged`` is false."""
+        """The poses so far. Those with faulty samples name the fault and do not
+        contribute to the noise of the others, unless ``judged`` is false."""
         windows = self.windows
         if windows is None:
             return []
-        return poses_of(windows, self.spans(), untrusted_poses(self.findings()) if judged else None)
+        return poses_of(windows, self.spans(), faulty_poses(self.findings()) if judged else None)
 
     def spans(self) -> list[Span]:
-        """The still spans so far, found once for the same windows."""
+        """The still spans so far, cached for the same windows."""
         windows = self.windows
         if windows is None:
             return []
@@ -79,9 +78,8 @@ class PoseFinder:
             self._spans = (len(windows), self._stillness.spans(self._turn_s))
         return self._spans[1]
 
-    def findings(self) -> list[Finding]:
-        """What is wrong with the samples so far, judged once for the same
-        samples."""
+    def findings(self) -> list[QualityFinding]:
+        """Faults of the samples so far, cached."""
         if self._findings is None:
             self._findings = self._quality.findings(self.windows, self.spans())
         return self._findings

@@ -1,4 +1,4 @@
-"""Still spans as poses: all that is known of each."""
+"""Still spans as poses: mean, covariance, channels and history of each."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses.noise_spectrum import NoiseLevels
 from triaxcal.poses.pose_noise import noise_of_means
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.shaken import LOUD
+from triaxcal.poses.stillness.vibration import VIBRATING
 from triaxcal.poses.stillness.windows import Windows, resolution
 
-# How a logged channel goes about the middle of a pose: its rate and its bend, with
-# their standard errors.
+# The time course of a logged channel about the middle of a pose: rate and bend,
+# with their standard errors.
 
 
 class ChannelCourse(NamedTuple):
-    """A channel about the middle of a pose: standard error of its mean; its
-    rate per second and its bend per second², each with its standard error."""
+    """A channel about the middle of a pose: standard error of its mean; its rate per
+    second and its bend per second², each with its standard error."""
 
     error: float
     rate: float
@@ -32,19 +32,19 @@ class ChannelCourse(NamedTuple):
 
 
 def courses_of(w: Windows, spans: Sequence[Span]) -> list[dict[str, ChannelCourse]]:
-    """Of each span, by channel."""
+    """The courses of each span, by channel."""
     steps = {name: _step(channel) for name, channel in w.channels.items()}
     return [_course(w, s, steps) for s in spans]
 
 
 def _course(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, ChannelCourse]:
-    """By a parabola through the span and half its length on either side: a
-    thermometer's steps and noise are spread over what is around the pose as
-    well.
-    """
+    """A parabola through the span and half its length on either side: steps and noise
+    of a thermometer average over the surroundings of the pose too."""
+    # Windows of the span, extended by half its length on either side.
     begin, end = int(w.start_ns[s.first]), int(w.end_ns[s.last])
     half = (end - begin) // 2
     first, last = np.searchsorted(w.start_ns, [begin - half, end + half])
+    # Least-squares parabola in time, scaled to the span.
     t_s = (w.start_ns[first:last] + w.period_ns / 2 - (begin + end) / 2) * 1e-9
     scale = max((end - begin) * 1e-9, 1e-9)
     powers = np.vander(t_s / scale, 3, increasing=True)
@@ -55,7 +55,7 @@ def _course(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, Channe
         values = channel[first:last] - channel[first:last].mean()
         middle, rate, bend = gain @ values
         scatter = float(np.sqrt(np.sum((values - powers @ [middle, rate, bend]) ** 2) / max(len(t_s) - 3, 1)))
-        # Of the order of the slope that a step of a coarse thermometer makes.
+        # A step of a coarse thermometer adds an error of the order of its slope.
         step = steps[name]
         out[name] = ChannelCourse(
             error=scatter / np.sqrt(len(s.used)),
@@ -68,19 +68,18 @@ def _course(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, Channe
 
 
 def _step(channel: Floats) -> float:
-    """By how much a channel moves where it stands still between its moves; zero
-    where it is always on the move. A step that falls inside a window makes two
-    moves, so it is more than half a step."""
+    """Median change of a channel that is constant between changes; zero where it
+    always changes. A step inside a window makes two changes, so the result is more
+    than half a step."""
     moves = np.abs(np.diff(channel))
     return float(np.median(moves[moves > 0])) if 0 < np.count_nonzero(moves) < len(moves) / 2 else 0.0
 
 
 @dataclass(frozen=True)
 class Run:
-    """Which of several recordings of a unit a pose is of: the ``index``
-    (0-based) of how many, and the middle of its poses, from which time counts
-    there. Alone, time counts as it was recorded.
-    """
+    """The recording of a pose among several of one unit: ``index`` (0-based), ``of``
+    how many, and the middle of its poses, from which time counts. A single recording
+    keeps its own time."""
 
     index: int = 0
     of: int = 1
@@ -89,18 +88,18 @@ class Run:
 
 @dataclass(frozen=True)
 class PoseStart:
-    """When a pose began: seconds from the first sample of its recording, and
-    which of several (0-based)."""
+    """The time at which a pose began, in seconds from the first sample of its
+    recording, and the recording among several (0-based)."""
 
     start_s: float
     recording: int | None = None
 
 
 @dataclass(frozen=True)
-class ShakenPart:
-    """A stretch of time in which the outputs scatter by up to ``scatter``
-    (standard deviation of a sample of the axis that scatters most, output
-    units), so many ``times`` as in the rest of the pose."""
+class VibrationPart:
+    """A stretch of time under vibration with a ``scatter`` (standard deviation of a
+    sample, axis with the largest, output units), so many ``times`` that of the rest
+    of the pose."""
 
     start_s: float
     end_s: float
@@ -110,30 +109,30 @@ class ShakenPart:
 
 @dataclass(frozen=True)
 class Pose:
-    """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean,
-    output units. ``dof`` are the degrees of freedom behind the covariance
-    (along the measured vector, where there are six poses or more), and
-    ``shared_dof`` those behind what the covariances of all poses have in
-    common, infinite where that is nothing; ``noise_levels`` say the same in
-    full, where all poses of a recording have it in common.
+    """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output
+    units.
 
-    ``channels`` are means over the span; ``t_s`` is the middle of the span,
-    like ``start_s`` and ``end_s`` in seconds from the first sample. ``creep``
-    (3,) is the change of the outputs along the span, output units, where it is
-    more than noise, else zero; ``slope`` (3,) the same whether it is noise or
-    not, and ``slope_error`` the standard error of its part along the measured
-    vector, infinite where it is not known. ``rates`` are the channels' slopes
-    in the middle of the span, per second, and ``bends`` their second
-    derivatives, per second², from the span and half its length on either side;
-    ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors
-    of mean, slope and bend from the scatter that these leave. ``before`` (3,)
-    is the mean of the pose before, None in the first; ``scatter`` (3,) the
-    variance of a sample inside the span, output units squared. ``fault`` is
-    what its samples are to be blamed for (`triaxcal.poses.quality`), if at all:
-    no fit uses such a pose. ``shaken`` are parts of it that its mean leaves
-    out. ``restless`` is how many times as much as most poses it scatters where
-    that is far more than they differ, which its covariance allows for; else 1.
-    ``parted``: a move that shaking hid lies between it and the pose before.
+    ``dof`` are the degrees of freedom of the covariance (along the measured vector,
+    for six poses or more), ``shared_dof`` those of the part that the covariances of
+    all poses share, infinite where there is none; ``noise_levels`` describe this part
+    in full, where all poses of a recording share it.
+
+    ``channels`` are means over the span; ``t_s`` is the middle of the span, like
+    ``start_s`` and ``end_s`` in seconds from the first sample. ``creep`` (3,) is the
+    change of the outputs along the span, output units, where it exceeds the noise,
+    else zero; ``slope`` (3,) is the same without that condition, and ``slope_error``
+    the standard error of its part along the measured vector, infinite where unknown.
+    ``rates`` are the channels' slopes in the middle of the span, per second,
+    ``bends`` their second derivatives, per second², from the span and half its length
+    on either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` their
+    standard errors from the residual scatter. ``before`` (3,) is the mean of the
+    previous pose, None in the first; ``scatter`` (3,) the variance of a sample inside
+    the span, output units squared. ``fault`` names a fault of its samples
+    (`triaxcal.poses.quality`), if any: no fit uses such a pose. ``shaken`` are
+    vibrating parts that its mean excludes. ``restless`` is the ratio of its scatter
+    to that of most poses where it is far larger, which its covariance allows for;
+    else 1. ``parted``: a move hidden by vibration lies between it and the previous
+    pose.
     """
 
     start_s: float
@@ -157,7 +156,7 @@ class Pose:
     noise_levels: NoiseLevels | None = field(default=None, repr=False, compare=False)
     run: Run = field(default_factory=Run)
     fault: str = ""
-    shaken: tuple[ShakenPart, ...] = ()
+    shaken: tuple[VibrationPart, ...] = ()
     restless: float = 1.0
     parted: bool = False
 
@@ -200,8 +199,8 @@ class Pose:
 
 
 class StillSpan(Protocol):
-    """Where and when a unit was still: all of a pose but its noise. ``mean``
-    (3,) output units; times in seconds."""
+    """A still span: mean and times of a pose without its noise. ``mean`` (3,) output
+    units; times in seconds."""
 
     @property
     def start_s(self) -> float: ...
@@ -233,9 +232,8 @@ def still_spans_of(w: Windows, spans: Sequence[Span]) -> list[StillSpan]:
 
 def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None = None) -> list[Pose]:
     """The poses of the still spans, in order of time. ``faults`` name those, by
-    index, whose samples are not to be trusted: they tell nothing of the noise
-    of the others.
-    """
+    index, with faulty samples: they do not contribute to the noise of the others."""
+    # Noise of the sound poses from the sound poses alone.
     if faults:
         sound = iter(poses_of(w, [s for i, s in enumerate(spans) if i not in faults]))
         return [
@@ -244,6 +242,7 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         ]
     if not spans:
         return []
+    # Means, noise, and the time courses of the channels.
     held = still_spans_of(w, spans)
     noise = noise_of_means(w, spans, np.array([h.mean for h in held]))
     courses = courses_of(w, spans)
@@ -268,7 +267,7 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             bend_errors={name: course.bend_error for name, course in courses[i].items()},
             before=held[i - 1].mean if i else None,
             scatter=w.variance[s.used].mean(axis=0) * (w.size - 1) / w.size + w.mean[s.used].var(axis=0),
-            shaken=_shaken_parts(w, s),
+            shaken=_vibration_parts(w, s),
             restless=float(noise.restless[i]),
             parted=s.parted,
         )
@@ -276,16 +275,16 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
     ]
 
 
-def _shaken_parts(w: Windows, s: Span) -> tuple[ShakenPart, ...]:
-    if not len(s.shaken):
+def _vibration_parts(w: Windows, s: Span) -> tuple[VibrationPart, ...]:
+    if not len(s.vibrating):
         return ()
     begin, usual = int(w.start_ns[0]), np.maximum(w.variance[s.used].mean(axis=0), resolution(w) ** 2 / 12)
     parts = []
-    for at in np.split(s.shaken, np.flatnonzero(np.diff(s.shaken) > 1) + 1):
+    for at in np.split(s.vibrating, np.flatnonzero(np.diff(s.vibrating) > 1) + 1):
         start_s, end_s = (int(w.start_ns[at[0]]) - begin) * 1e-9, (int(w.end_ns[at[-1]]) - begin) * 1e-9
-        loud = (w.variance[at] > LOUD**2 * usual).any(axis=1)
-        variance = w.variance[at[loud] if loud.any() else at].mean(axis=0)
+        strong = (w.variance[at] > VIBRATING**2 * usual).any(axis=1)
+        variance = w.variance[at[strong] if strong.any() else at].mean(axis=0)
         axis = int(np.argmax(variance / usual))
         scatter, times = np.sqrt(variance[axis]), np.sqrt(variance[axis] / usual[axis])
-        parts.append(ShakenPart(start_s, end_s, float(scatter), float(times)))
+        parts.append(VibrationPart(start_s, end_s, float(scatter), float(times)))
     return tuple(parts)

@@ -1,4 +1,4 @@
-"""How poses are named in sentences: by when they began."""
+"""Names of poses in sentences: the time at which they began."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def moment(began: PoseStart) -> str:
 
 
 def the_poses(began: Iterable[PoseStart]) -> str:
-    """By when they began."""
+    """The poses, by the times at which they began."""
     return " and ".join(f"the pose at {moment(b)}" for b in began)

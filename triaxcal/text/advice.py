@@ -123,7 +123,7 @@ def _apart(loop: Loop) -> Iterator[str]:
 
 def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     actions = loop.advice.actions
-    if beside := [_beside(action) for action in actions if action.kind in (ActionKind.LOG, ActionKind.HOLD)]:
+    if beside := [_other_action(action) for action in actions if action.kind in (ActionKind.LOG, ActionKind.HOLD)]:
         yield "; ".join(beside)
     if poses := [_pose(action, loop) for action in actions if action.kind not in (ActionKind.LOG, ActionKind.HOLD)]:
         yield f"record next, to tell what acts, in this order: {', then '.join(poses)}"
@@ -136,7 +136,7 @@ def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
         )
 
 
-def _beside(action: Action) -> str:
+def _other_action(action: Action) -> str:
     if action.kind is ActionKind.HOLD:
         return f"hold each pose for {action.hold_s:.0f} s, since each has an error of its own"
     return f"log {action.channel or 'what else may go with the time: the supply, a second temperature'}"

@@ -17,7 +17,7 @@ from triaxcal.effects.contract import (
     lag_in,
     rate_of,
 )
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.model.samples import Moment
 from triaxcal.number_format import plain
 
@@ -34,7 +34,7 @@ def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several:
     return tuple(dict.fromkeys(out))
 
 
-def as_at(moment: HoldsAt) -> str:
+def as_at(moment: ReferenceEpoch) -> str:
     """The moment of a recording for which a correction holds that knows no
     time."""
     which = {Moment.END: "the end", Moment.MEAN: "the mean of the poses"}.get(moment.moment)

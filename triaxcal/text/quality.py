@@ -11,13 +11,13 @@ POSES_NAMED = 8
 """So many poses are named by when they begin; the others are counted."""
 
 
-def quality_line(finding: of.Finding, unit: str = "") -> str:
+def quality_line(finding: of.QualityFinding, unit: str = "") -> str:
     """As it stands under ``data_quality``; ``unit`` is that of the outputs."""
     return f"{finding.name}: {quality(finding, unit)}"
 
 
 @singledispatch
-def quality(finding: of.Finding, unit: str = "") -> str:
+def quality(finding: of.QualityFinding, unit: str = "") -> str:
     """Which axis, how much and where. Raises TypeError for a kind that has no
     words."""
     raise TypeError(f"no words for {type(finding).__name__}")

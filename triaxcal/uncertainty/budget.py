@@ -1,5 +1,5 @@
-"""The components combined: root sum of squares, degrees of freedom by Welch and
-Satterthwaite, and which dominates."""
+"""Combination of the components: root sum of squares, degrees of freedom by Welch and
+Satterthwaite, and the dominant component."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class Combined:
 
 @dataclass(frozen=True)
 class Budget:
-    """Components, largest first; ``not_evaluated`` are sources that nothing is
-    known of."""
+    """Components, largest first; ``not_evaluated`` are sources without
+    information."""
 
     components: tuple[Component, ...]
     parameters: Combined
@@ -64,13 +64,13 @@ class Budget:
 
     @property
     def magnitude_if_halved(self) -> float:
-        """Standard uncertainty of the magnitude if the dominant component were
-        half as large."""
+        """Standard uncertainty of the magnitude with the dominant component
+        halved."""
         least = float(self.magnitude.standard**2) - 0.75 * self.dominant.magnitude**2
         return float(np.sqrt(max(least, 0.0)))
 
     def share(self, component: Component) -> float:
-        """Of the variance of the magnitude, 0…1."""
+        """Share of a component in the variance of the magnitude, 0…1."""
         whole = float(self.magnitude.standard**2)
         return component.magnitude**2 / whole if whole > 0 else 0.0
 
@@ -78,7 +78,7 @@ class Budget:
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
     """The budget of a calibration fitted to still poses
     (`triaxcal.estimate.pose_fit.fit`), or with biases from them
-    (`triaxcal.inputs.bias_update`)."""
+    (`triaxcal.inputs.bias_update`), at coverage ``level``."""
     stated = stated or Stated()
     if calibration.update is not None:
         sphere = SphereMean.of(calibration)
@@ -108,15 +108,16 @@ def _budget(
 
 
 def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, least: Floats) -> Combined:
-    """Root sum of squares, and degrees of freedom by annex G.4. Noise and what
-    residuals add to it are one source, of the ``dof`` that the fit gives them,
-    since the one is judged by the other. Never below what the fit by itself
-    states (``least``), though thermal effects may be why its residuals are so
-    large.
-    """
+    """Root sum of squares, with degrees of freedom by JCGM 100, G.4. Noise and excess
+    variance are one source with the ``dof`` of the fit, since one is judged by the
+    other. Never below the standard error of the fit itself (``least``), even if
+    thermal effects cause its residuals."""
+    # Sum of squares of all lines, and of those of type A.
     variance = sum((u**2 for _, u in lines), start=np.zeros_like(lines[0][1]))
     variance = np.maximum(variance, least**2)
     scatter = sum((u**2 for c, u in lines if c.evaluation == "A"), start=np.zeros_like(lines[0][1]))
+    # Welch–Satterthwaite: ν = u⁴ / (u_A⁴ / ν_A); type B has infinite degrees of
+    # freedom.
     effective = variance**2 / np.maximum(scatter**2 / dof, 1e-300)
     return Combined(np.sqrt(variance), np.where(variance > 0, np.minimum(effective, DOF_MOST), DOF_MOST), level)
 

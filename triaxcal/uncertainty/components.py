@@ -1,5 +1,5 @@
-"""The sources of the budget, each evaluated from the linearised fit; those of
-the temperature have their own file."""
+"""The components of the budget, each from the linearised fit; those of temperature
+are in `thermal`."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ from triaxcal.uncertainty.statements import (
 )
 
 CERTAIN = 0.99
-"""Effects of this probability do not compete."""
+"""Effects of this probability have no competing models."""
 NOTHING = 1e-12
-"""Share of a variance that is none."""
+"""Share of a variance that is negligible."""
 
 
 @dataclass(frozen=True)
 class Component:
     """One line of the budget.
 
-    ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` degrees of
-    freedom behind it. ``parameters`` (p,) standard uncertainties of
-    `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere.
+    ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` its degrees of
+    freedom. ``parameters`` (p,) are standard uncertainties of
+    `Calibration.parameters`; ``magnitude`` that of |a|, rms over the sphere.
     """
 
     source: str
@@ -71,25 +71,26 @@ class Component:
         basis: Basis,
         by: Remedy,
     ) -> Component:
-        """Of a source by the ``covariance`` (p,p) of the parameters that it
-        makes; ``by`` what would halve it."""
+        """The component of a source from its ``covariance`` (p,p) of the parameters;
+        ``by`` is the remedy that would halve it."""
         parameters = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         return cls(source, evaluation, dof, parameters, sphere.magnitude(covariance), basis, by)
 
 
 def statistical(calibration: Calibration, linearised: ErrorPropagation, share: float) -> list[Component]:
-    """What the scatter inside the poses, their creep, and residuals beyond both
-    say, of which thermal effects leave the ``share``."""
+    """Components of the scatter inside the poses, of their creep, and of the excess
+    variance, of which ``share`` is not due to thermal effects."""
     poses = [p.pose for p in calibration.poses if p.used]
+    # Variance of |a| by creep: gᵀ (c cᵀ/12) g.
     _, by_u = calibration.sensor.magnitude(linearised.problem.u, linearised.problem.covariates)
     creeping = np.array([p.creep_covariance for p in poses])
     S = linearised.by_residual
     creep = np.zeros(S.shape[1])
     creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
-    # Creep across the measured vector, of which a processor's rounding leaves
-    # something, is none.
+    # Ignore the rounding error of creep across the measured vector.
     creep = np.where(creep > NOTHING * linearised.noise**2, creep, 0.0)
     noise = np.maximum(linearised.noise**2 - creep, 0.0)
+    # Propagate noise and creep: S diag(s²) Sᵀ, S = ∂parameters/∂residuals.
     out = [
         Component.of(
             linearised,
@@ -106,6 +107,7 @@ def statistical(calibration: Calibration, linearised: ErrorPropagation, share: f
         out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, basis, CreepHalved()))
     if calibration.prior_sd is not None:
         return out + _between(calibration, linearised, (S * linearised.noise**2) @ S.T)
+    # The remaining covariance of the fit is due to excess variance or Birge ratio.
     excess = share * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         raised: Basis = BirgeFactor(calibration.birge_ratio)
@@ -116,8 +118,8 @@ def statistical(calibration: Calibration, linearised: ErrorPropagation, share: f
 
 
 def _between(calibration: Calibration, linearised: ErrorPropagation, noise: Floats) -> list[Component]:
-    """What the ``noise`` (p,p) of the poses leaves of a covariance that is one
-    over all that may act; thermal effects have a line of their own."""
+    """The covariance of an average less the ``noise`` (p,p) of the poses and thermal
+    effects, which have lines of their own."""
     thermal = 0.0 if calibration.thermal is None else calibration.thermal
     rest = positive_semidefinite(calibration.covariance - noise - thermal)
     names = tuple(name for name, p in calibration.weights.items() if p < CERTAIN)
@@ -126,13 +128,15 @@ def _between(calibration: Calibration, linearised: ErrorPropagation, noise: Floa
 
 
 def positive_semidefinite(covariance: Floats) -> Floats:
-    """The nearest that is one: a difference of two may have lost that."""
+    """The nearest positive semidefinite matrix: a difference of two covariances may
+    not be one."""
     size, axes = np.linalg.eigh(covariance)
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
 
 
 def half_the_noise(poses: Sequence[Pose]) -> Remedy:
-    """What would halve a component that is the noise of the poses."""
+    """The remedy for a component due to the noise of the poses: four times as long,
+    or four times as many."""
     return LongerOrMorePoses(4 * _median_duration_s(poses), 4 * len(poses))
 
 
@@ -143,14 +147,15 @@ def _median_duration_s(poses: Sequence[Pose]) -> float:
 def reference(linearised: ErrorPropagation, stated: Stated) -> list[Component]:
     if not stated.reference:
         return []
-    # What |a| does inside the poses should be nothing, whatever the reference.
+    # Slopes inside the poses do not depend on the reference.
     shift = linearised.by_residual[:, : len(linearised.problem.u)].sum(axis=1) * stated.reference
     by = ReferenceKnown(stated.reference / 2)
     return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_basis, by)]
 
 
 def of_update(calibration: Calibration, update: BiasUpdate, sphere: SphereMean) -> list[Component]:
-    """What the poses of an update leave open, and what it keeps."""
+    """Components of a bias update: those of its poses, and those of the kept
+    parameters."""
     poses = [p.pose for p in calibration.poses if p.used]
     bases: Mapping[str, tuple[Basis, Remedy]] = {
         "noise": (WithinPoseScatter(len(poses), _median_duration_s(poses)), half_the_noise(poses)),
@@ -181,7 +186,7 @@ def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
 
 
 def unmodelled(calibration: Calibration) -> list[Component]:
-    """What acts on |a| and no parameter describes, rms over the sphere."""
+    """Unmodelled contribution to |a|, rms over the sphere."""
     part = calibration.unmodelled
     if part is None or not part.along:
         return []

@@ -1,5 +1,5 @@
-"""How well a calibration predicts another recording of the same unit: beside
-its own error, how units start."""
+"""Uncertainty of a calibration in another recording of the same unit: its own error
+and the start-to-start bias."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from triaxcal.poses.covariates import at_moment
 from triaxcal.uncertainty.budget import Budget
 
 START_TO_START = 2e-3
-"""In references, of |a| over the sphere, where one recording is all that is
-known: eight sensors of a mass-market board (MIMU4444, runs 1 to 4) came back by
-1.5, 0.5 and 3.4 mg on their three axes. A unit of another class says otherwise
-by several recordings."""
+"""In references, of |a| over the sphere, for a single recording: eight sensors of a
+mass-market board (MIMU4444, runs 1 to 4) repeated within 1.5, 0.5 and 3.4 mg on their
+three axes. Several recordings of a unit replace the assumption."""
 
 FEWEST = 3
-"""Poses of a run that tell its bias."""
+"""Number of poses of a run that determine its bias."""
 
 
 class Source(StrEnum):
@@ -32,10 +31,10 @@ class Source(StrEnum):
 
 @dataclass(frozen=True)
 class NextRecording:
-    """``standard`` and ``expanded_uncertainty`` of |a|, rms over the sphere, at
-    the reference conditions and the moment for which the calibration holds;
-    ``start_to_start`` the standard deviation of |a| from one recording to
-    another. In the unit of the reference."""
+    """``standard`` and ``expanded_uncertainty`` of |a|, rms over the sphere, at the
+    reference conditions and the epoch of the calibration; ``start_to_start`` is the
+    standard deviation of |a| from one recording to another. In the unit of the
+    reference."""
 
     standard: float
     expanded_uncertainty: float
@@ -44,8 +43,8 @@ class NextRecording:
 
 
 def next_recording(c: Calibration, budget: Budget, start_to_start: float | None = None) -> NextRecording:
-    """``start_to_start`` is known of the unit's type, in the unit of the
-    reference; from several recordings it is measured."""
+    """``start_to_start`` is a known value of the unit's type, in the unit of the
+    reference; several recordings determine it."""
     measured = _between_runs(c)
     if c.update is not None:  # how many recordings told the earlier one is not known
         start, dof = c.update.start_to_start, np.inf
@@ -55,6 +54,7 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
     else:
         start = START_TO_START * c.reference if start_to_start is None else start_to_start
         dof, source = np.inf, Source.ASSUMED
+    # Combine both, with Welch–Satterthwaite degrees of freedom.
     own = float(budget.magnitude.standard)
     whole = np.hypot(own, start)
     # Welch and Satterthwaite, JCGM 100, G.4.
@@ -64,15 +64,15 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
 
 
 def _between_runs(c: Calibration) -> tuple[float, float] | None:
-    """The standard deviation of |a| over the sphere that biases from run to run
-    make, at the moment for which the calibration holds, and its degrees of
-    freedom; None of one recording."""
+    """Standard deviation of |a| over the sphere by the biases of the runs, at the
+    epoch of the calibration, and its degrees of freedom; None for one recording."""
     poses = [p for p in c.poses if p.used]
     runs = sorted({p.pose.run.index for p in poses})
     if len(runs) < 2:
         return None
     found = c.sensor.radius(np.array([p.pose.mean for p in poses]), c.covariates_of([p.pose for p in poses]))
     off, error = found.length - c.reference, np.array([p.error_g for p in poses])
+    # Bias shift of every run, and its variance by noise.
     biases, variances = [], []
     for run in runs:
         own = np.array([p.pose.run.index == run for p in poses])
@@ -82,6 +82,7 @@ def _between_runs(c: Calibration) -> tuple[float, float] | None:
             variances.append(variance)
     if len(biases) < 2:
         return None
+    # Variance between runs, less that of the noise.
     by_noise = np.mean(variances, axis=0).sum()
     spread = np.var(biases, axis=0, ddof=1).sum() - by_noise
     # Starts that agree within their noise may differ by as much as their mean
@@ -90,8 +91,8 @@ def _between_runs(c: Calibration) -> tuple[float, float] | None:
 
 
 def _in_run(c: Calibration, run: int) -> Floats:
-    """(3,) what effects of the clocks, and of single runs, add to the bias in a
-    run at the moment of its clock."""
+    """(3,) contribution to the bias of effects of the clocks, and of single runs, in
+    a run at the epoch."""
     held = at_moment(c.channel_reference, 1, c.moment)
     if RUN in held:
         held[RUN] = np.array([run - c.channel_reference[RUN]])
@@ -99,26 +100,27 @@ def _in_run(c: Calibration, run: int) -> Floats:
 
 
 def _shift(by_v: Floats, off: Floats, error: Floats) -> tuple[Floats, Floats]:
-    """(3,) by how much the biases of a run are off, and the variances of that
+    """(3,) error of the biases of a run by weighted least squares, and its variances
     by noise."""
     weighted = by_v / error[:, None]
     inverse = np.linalg.pinv(weighted.T @ weighted)
     return inverse @ weighted.T @ (off / error), np.diag(inverse)
 
 
-# Three uncertainties of |a|, each of other readings, under one name each
-# everywhere: this fit, this session's poses, another day.
+# Three uncertainties of |a| for different readings, each with one name everywhere:
+# this fit, this session's poses, another day.
 
 NAMES = ("this fit", "this session's poses", "another day")
 
 
 @dataclass(frozen=True)
 class Scopes:
-    """Expanded, of |a|, rms over the sphere, in the unit of the reference.
+    """Expanded uncertainties of |a|, rms over the sphere, in the unit of the
+    reference.
 
-    ``this_fit``: of the calibration itself, by its budget. ``this_session``: of
-    one more pose of the recording, with its noise and whatever the residuals
-    show. ``another_day``: of the next recording, with how the unit starts.
+    ``this_fit``: of the calibration itself, by its budget. ``this_session``: of one
+    more pose of the recording, with its noise and the residual error.
+    ``another_day``: of the next recording, with the start-to-start bias.
     """
 
     this_fit: float
@@ -127,8 +129,8 @@ class Scopes:
 
     @classmethod
     def of(cls, c: Calibration, budget: Budget, following: NextRecording) -> Scopes:
-        """A pose that the fit has not seen is as far off as the cross-validated
-        ones, and by no less than what the fit and its residuals make."""
+        """A pose that the fit has not seen has the cross-validated error, but no less
+        than fit and residuals together."""
         standard, k = float(budget.magnitude.standard), float(budget.magnitude.coverage)
         crossed = c.residual.cross_validated_rms_g
         pose = max(float(np.hypot(standard, c.residual.rms_g)), crossed or 0.0)

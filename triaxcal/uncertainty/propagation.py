@@ -1,5 +1,5 @@
-"""The fit linearised at its solution: from errors of the poses' residuals to
-parameters, and from these to |a|."""
+"""Linear propagation at the solution of a fit: from errors of the residuals to the
+parameters, and on to |a|."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
 
 SPHERE = 200
-"""Directions in a mean over the sphere. The variance of the magnitude is a
-polynomial of the fourth degree there, which so many average well."""
+"""Number of directions in a mean over the sphere. The variance of the magnitude is a
+polynomial of the fourth degree there."""
 
 
 class SphereMean:
-    """The sphere that parameters are judged on. ``by_parameters`` (m,p): change
-    of |a| over the sphere by the parameters."""
+    """The sphere on which parameters are judged. ``by_parameters`` (m,p): derivative
+    of |a| by the parameters."""
 
     by_parameters: Floats
 
     @classmethod
     def of(cls, calibration: Calibration) -> SphereMean:
-        """At the conditions of its use."""
+        """The sphere under the covariates of use."""
         found, up = cls(), spiral(SPHERE) * calibration.reference
         covariates = at_moment(calibration.channel_reference, len(up), calibration.moment)
         u = calibration.sensor.output(up, covariates)
@@ -40,16 +40,16 @@ class SphereMean:
         return found
 
     def magnitude(self, covariance: Floats) -> float:
-        """rms over the sphere of the uncertainty of |a| that a covariance (p,p)
-        of the parameters makes."""
+        """Rms uncertainty of |a| over the sphere from a covariance (p,p) of the
+        parameters: √(mean of diag(J C Jᵀ))."""
         return float(
             np.sqrt(max(np.einsum("mi,ij,mj->", *[self.by_parameters, covariance, self.by_parameters]), 0.0) / SPHERE)
         )
 
 
 class ErrorPropagation(SphereMean):
-    """The fit linearised at its solution, and the sphere that its parameters
-    are judged on."""
+    """The fit linearised at its solution, and the sphere on which its parameters are
+    judged."""
 
     def __init__(self, calibration: Calibration) -> None:
         sensor = calibration.sensor
@@ -58,10 +58,8 @@ class ErrorPropagation(SphereMean):
         effects = [effect for effect, _ in sensor.effects]
         problem = problem_of(poses, signs=signs, reference=calibration.reference, effects=effects)
         problem = with_history(problem, poses, sensor)
-        # A model without a channel holds at its mean; the reference of one that
-        # has it is rounded to read well. To a millionth, since processors
-        # differ in the last digits, and a steady channel should not seem to
-        # move.
+        # Channels of the model keep their rounded reference, others get their mean. The
+        # mean is rounded to a millionth, since processors differ in the last digits.
         means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
         self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
         self.state = State.of(self.problem, sensor)
@@ -69,26 +67,27 @@ class ErrorPropagation(SphereMean):
         if calibration.slopes:
             self.problem = with_slopes(self.problem, poses, self.effects) or self.problem
         self.noise = linearise_all(self.problem, self.state)[2]
-        """(n,) standard errors of the residuals by the noise and creep of the
-        poses."""
+        """(n,) standard errors of the residuals from noise and creep of the poses."""
         self.problem = Excess(excess_g=calibration.excess_g).added_to(self.problem, self.state)
         _, J, self.error = linearise_all(self.problem, self.state)
-        # What the shapes of effects were chosen by blurs the parameters too.
+        # The uncertainty of the shapes of effects adds to that of the parameters.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
+        # Generalised inverse of the weighted Jacobian, with the prior; then to
+        # parameters.
         self.gain = gain_given_prior(self.weighted, calibration.prior_sd)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
-        """(p,n): shift of the parameters for an error of each residual
+        """(p,n): change of the parameters for an error of each residual
         (`likelihood.linearise_all`)."""
         self.up = spiral(SPHERE) * calibration.reference
-        """(m,3) specific force all over the sphere."""
+        """(m,3) specific force over the sphere."""
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)
         self.by_parameters = J @ np.linalg.inv(self.G)
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
-        """Outputs of the unit all over the sphere, under the conditions of its
-        use but for ``shift``."""
+        """Outputs of the unit over the sphere, under the covariates of use plus
+        ``shift``."""
         reference = self.problem.channel_reference
         covariates = at_moment(reference, len(self.up), calibration.moment)
         u = calibration.sensor.output(self.up, covariates)
@@ -97,8 +96,9 @@ class ErrorPropagation(SphereMean):
         return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, slopes=None)
 
     def when_shifted(self, calibration: Calibration, channel: str, by: float) -> Floats:
-        """(p,) what the parameters would have to be for |a| to stay right were
-        a channel off by so much."""
+        """(p,) change of the parameters that keeps |a| right if a channel is off by
+        this value."""
+        # Residuals of |a| with the shifted channel, fitted by the nine parameters.
         shifted = self._sphere(calibration, {channel: by})
         r, _, _ = linearise(shifted, self.state, jacobian=False)
         nine = self.by_parameters[:, :9]
@@ -106,8 +106,9 @@ class ErrorPropagation(SphereMean):
 
 
 def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
-    """(p,n) of parameters by weighted residuals, where coefficients are held by
-    their ``prior_sd``. One of zero spread is fixed: its row is zero."""
+    """(p,n) gain from weighted residuals to parameters, with normal priors of
+    standard deviation ``spread`` on the coefficients. A coefficient of zero spread is
+    fixed: its row is zero."""
     n, p = weighted.shape
     held_by = np.full(p, np.inf)
     if spread is not None:
@@ -115,6 +116,7 @@ def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     free = np.flatnonzero(held_by > 0)
     # Columns are scaled: those of a temperature and of a cube are decades apart.
     norms = np.maximum(np.linalg.norm(weighted[:, free], axis=0), 1e-300)
+    # The prior as additional rows 1/σ of the regression (ridge).
     prior_rows = np.diag(1 / held_by[free])[np.isfinite(held_by[free])] / norms
     gain = np.zeros((p, n))
     gain[free] = np.linalg.pinv(np.concatenate([weighted[:, free] / norms, prior_rows]), rcond=1e-13)[:, :n]
@@ -122,33 +124,33 @@ def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     return gain
 
 
-# A calibration that is to hold for a moment after its recording: how well effects
-# of time are known there.
+# Extrapolation: the uncertainty of effects of time after the end of the recording.
 
 STEP = 1e-4
-"""Relative step of the derivative by a shape, far above rounding and far below
-the curvature of any effect."""
+"""Relative step of the derivative by a shape, far above rounding and far below the
+curvature of any effect."""
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
-"""(6,3) up along each sensitive axis, both ways, where a bias shows whole."""
+"""(6,3) up along each sensitive axis, both ways, where a bias shows in full."""
 
 
 @dataclass(frozen=True)
 class Extrapolated(Caution):
-    """It holds ``beyond_s`` after the last pose; what effects of time make of
-    the readings there has this standard uncertainty (of the axis and the face
-    where it is largest), in the unit of the reference vector."""
+    """The calibration holds ``beyond_s`` after the last pose. Effects of time then
+    add this standard uncertainty to the readings (axis and face with the largest), in
+    the unit of the reference vector."""
 
     beyond_s: float
     uncertainty_g: float
 
 
 def extrapolated(c: Calibration) -> Extrapolated | None:
-    """None where the moment lies within the recording, or no effect goes with
+    """None where the moment lies within the recording, or no effect depends on
     time."""
     if c.holds_at is None or not c.poses:
         return None
     last = max(p.pose.run.index for p in c.poses)
     beyond_s = c.holds_at.t_s - max(p.pose.end_s for p in c.poses if p.pose.run.index == last)
+    # Sum over the effects of time: B C Bᵀ on each face, and the error of the shapes.
     at, variance = 9, np.zeros(len(FACES) * 3)
     for effect, q in c.sensor.effects:
         own = slice(at, at + len(q))
@@ -164,15 +166,15 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
 
 
 def _basis(effect: Effect, c: Calibration) -> Floats:
-    """(18,p) at the moment, on each face and axis, with everything else at its
-    reference."""
+    """(18,p) basis of an effect at the moment, on each face and axis, with all other
+    covariates at their references."""
     needed = {name: c.channel_reference[name] for name in effect.needs}
     basis = effect.basis(c.reference * FACES, at_moment(needed, len(FACES), c.moment))
     return np.asarray(basis.reshape(-1, basis.shape[-1]))
 
 
 def _by_shapes(effect: Effect, q: Floats, c: Calibration) -> Floats:
-    """(18,) what the standard errors of its shapes make of it."""
+    """(18,) standard uncertainty from the errors of the effect's shapes."""
     parts: Sequence[Floats] = [
         (_basis(reshaped(effect, name, value * (1 + STEP)), c) - _basis(effect, c)) @ q / (STEP * value) * error
         for name, (value, _) in effect.shape.items()
@@ -181,11 +183,10 @@ def _by_shapes(effect: Effect, q: Floats, c: Calibration) -> Floats:
     return np.asarray(np.linalg.norm(np.array(parts).reshape(-1, len(FACES) * 3), axis=0))
 
 
-# The standard uncertainty that a calibration gives the readings which it is applied
-# to.
+# The standard uncertainty of readings to which a calibration is applied.
 
 NOTHING = Unmodelled(0.0, 0.0)
-"""Where nothing acts beside the covariance."""
+"""No unmodelled contribution."""
 
 
 def uncertainty_of_readings(
@@ -195,14 +196,16 @@ def uncertainty_of_readings(
     covariates: Mapping[str, Floats],
     unmodelled: Unmodelled | None = None,
 ) -> Floats:
-    """(n,3) of the specific force at outputs u (n,3), for a ``covariance``
-    (p,p) of the sensor's parameters, and what acts beside them; NaN where the
-    covariance is not known."""
-    beside = unmodelled or NOTHING
+    """(n,3) standard uncertainty of the specific force at outputs u (n,3), from the
+    ``covariance`` (p,p) of the sensor's parameters and the unmodelled part; NaN where
+    the covariance is not known."""
+    unmodelled_part = unmodelled or NOTHING
+    # Unmodelled part: σ_along² up² + σ_across² (1 − up²) by component.
     variance = np.zeros(u.shape)
-    if beside != NOTHING:
+    if unmodelled_part != NOTHING:
         square = sensor.up(u, covariates) ** 2
-        variance += beside.along**2 * square + beside.across**2 * (1 - square)
+        variance += unmodelled_part.along**2 * square + unmodelled_part.across**2 * (1 - square)
+    # Variance of the parameters: sum over the principal axes of their covariance.
     for step in _steps(sensor, covariance, u, covariates):
         variance += step**2
     return np.asarray(np.sqrt(variance))
@@ -215,7 +218,7 @@ def uncertainty_of_magnitude(
     covariates: Mapping[str, Floats],
     unmodelled: Unmodelled | None = None,
 ) -> Floats:
-    """(n,) likewise of |a|."""
+    """(n,) the same for |a|."""
     up = sensor.up(u, covariates)
     variance = np.full(len(u), (unmodelled or NOTHING).along ** 2)
     for step in _steps(sensor, covariance, u, covariates):
@@ -224,8 +227,8 @@ def uncertainty_of_magnitude(
 
 
 def _steps(sensor: Sensor, covariance: Floats, u: Floats, covariates: Mapping[str, Floats]) -> Iterator[Floats]:
-    """(n,3) each: one standard error along each principal axis of the
-    covariance, and what it does."""
+    """(n,3) each: change of the specific force by one standard deviation along each
+    principal axis of the covariance."""
     if not np.isfinite(covariance).all():
         yield np.full(u.shape, np.nan)
         return

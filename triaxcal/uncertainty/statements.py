@@ -1,5 +1,4 @@
-"""What a budget rests on: what its user states, and how each component was
-found."""
+"""The basis of a budget: stated values, and the evaluation of each component."""
 
 from __future__ import annotations
 
@@ -11,19 +10,18 @@ import numpy as np
 from triaxcal.errors import InvalidData
 from triaxcal.model.gravity import local_gravity_g
 
-# What the lines of a budget rest on, what would halve them, and what it leaves out:
-# as values.
+# Basis and remedy of the lines of a budget, and sources that it omits, as values.
 
 
 @dataclass(frozen=True)
 class Basis:
-    """How a component was found."""
+    """The evaluation of a component."""
 
 
 @dataclass(frozen=True)
 class WithinPoseScatter(Basis):
-    """With its autocorrelation; the poses were held for ``duration_s`` in the
-    median."""
+    """Scatter with its autocorrelation; the median duration of the poses is
+    ``duration_s``."""
 
     poses: int
     duration_s: float
@@ -31,7 +29,8 @@ class WithinPoseScatter(Basis):
 
 @dataclass(frozen=True)
 class Creep(Basis):
-    """So many ``poses`` creep; rectangular over the change in each."""
+    """Number of creeping ``poses``; rectangular distribution over the change in
+    each."""
 
     poses: int
 
@@ -45,15 +44,15 @@ class BirgeFactor(Basis):
 
 @dataclass(frozen=True)
 class Excess(Basis):
-    """Every pose has an ``excess`` standard deviation of |a|, in the reference,
-    beside its noise."""
+    """Every pose has an ``excess`` standard deviation of |a| over its noise, in the
+    reference."""
 
     excess: float
 
 
 @dataclass(frozen=True)
 class StatedReference(Basis):
-    """The uncertainty of the reference; of normal gravity where there is a
+    """The uncertainty of the reference; that of normal gravity where there is a
     place. ``stated``, or that of gravity anomalies over the Earth."""
 
     latitude_deg: float | None = None
@@ -63,35 +62,34 @@ class StatedReference(Basis):
 
 @dataclass(frozen=True)
 class RegisterSteps(Basis):
-    """Rectangular over the steps of so many ``registers``."""
+    """Rectangular distribution over the steps of so many ``registers``."""
 
     registers: int
 
 
 @dataclass(frozen=True)
 class NotHeld(Basis):
-    """What holds the result lacks effects, whose place the other coefficients
-    take."""
+    """The device lacks effects, which its other coefficients replace."""
 
 
 @dataclass(frozen=True)
 class AveragedModels(Basis):
-    """Over all that may act, each by its probability; ``names`` are those that
-    are corrected and not certain."""
+    """Average over all possible effects by their probabilities; ``names`` are those
+    that are corrected and not certain."""
 
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class NoParameter(Basis):
-    """What probably acts on |a| and no parameter describes."""
+    """A probable contribution to |a| without a parameter."""
 
 
 @dataclass(frozen=True)
 class UnmodelledTemperature(Basis):
-    """The effects that the model lacks; the temperature moved by ``moved_k``
-    from pose to pose. ``identifiable``: the poses can tell what that did.
-    ``stated``: somebody said how sensitive such units are."""
+    """The effects that the model lacks; the temperature changed by ``moved_k`` from
+    pose to pose. ``identifiable``: the poses can determine the effects. ``stated``:
+    the sensitivity of such units was stated."""
 
     effects: tuple[str, ...]
     moved_k: float
@@ -101,8 +99,8 @@ class UnmodelledTemperature(Basis):
 
 @dataclass(frozen=True)
 class ProbableTemperature(Basis):
-    """The effects that the model lacks, each as probable and as large as the
-    poses leave it; the temperature moved by ``moved_k`` from pose to pose."""
+    """The effects that the model lacks, with their posterior probabilities and sizes;
+    the temperature changed by ``moved_k`` from pose to pose."""
 
     effects: tuple[str, ...]
     moved_k: float
@@ -123,21 +121,21 @@ class KeptParameters(Basis):
 
 @dataclass(frozen=True)
 class ChangedSince(Basis):
-    """Of what changes from recording to recording, by the earlier calibration
-    (``measured``) or assumed: all of the scale factors', and of the biases' as
-    much as the poses leave open."""
+    """Changes from recording to recording, by the earlier calibration (``measured``)
+    or assumed: those of the scale factors in full, those of the biases as far as the
+    poses leave them open."""
 
     measured: bool
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """What would halve a component."""
+    """A measure that would halve a component."""
 
 
 @dataclass(frozen=True)
 class LongerOrMorePoses(Remedy):
-    """Hold each pose so long, or record so many."""
+    """Poses of ``hold_s`` each, or so many ``poses``."""
 
     hold_s: float
     poses: int
@@ -150,18 +148,18 @@ class CreepHalved(Remedy):
 
 @dataclass(frozen=True)
 class CompleteModel(Remedy):
-    """Find what the model lacks, and record more poses."""
+    """Complete the model, and record more poses."""
 
 
 @dataclass(frozen=True)
 class FittedAnew(Remedy):
-    """All parameters by a whole set of poses."""
+    """Fit all parameters to a whole set of poses."""
 
 
 @dataclass(frozen=True)
 class ReferenceKnown(Remedy):
-    """To the standard uncertainty ``to_g``, in the unit of the reference
-    vector."""
+    """Know the reference to the standard uncertainty ``to_g``, in the unit of the
+    reference vector."""
 
     to_g: float
 
@@ -173,12 +171,12 @@ class HostCorrects(Remedy):
 
 @dataclass(frozen=True)
 class FinerRegisters(Remedy):
-    """By one bit."""
+    """Registers finer by one bit."""
 
 
 @dataclass(frozen=True)
 class ModelsDistinguished(Remedy):
-    """By the recordings that the findings ask for."""
+    """The recordings that the findings ask for."""
 
 
 @dataclass(frozen=True)
@@ -190,29 +188,29 @@ class TemperatureModelled(Remedy):
 
 @dataclass(frozen=True)
 class PosesAtOtherTemperatures(Remedy):
-    """Until these ``effects`` can be fitted."""
+    """Poses at other temperatures, until these ``effects`` can be fitted."""
 
     effects: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class SteadierTemperature(Remedy):
-    """Twice as steady; or one that swings until these ``effects`` can be
-    fitted."""
+    """Twice as steady a temperature; or one that varies until these ``effects`` can
+    be fitted."""
 
     effects: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class TemperatureKnown(Remedy):
-    """To the standard uncertainty ``to_k``."""
+    """Know the temperature to the standard uncertainty ``to_k``."""
 
     to_k: float
 
 
 @dataclass(frozen=True)
 class NotEvaluated:
-    """A source that nothing is known of."""
+    """A source without information."""
 
 
 @dataclass(frozen=True)
@@ -229,13 +227,13 @@ class TemperatureNotLogged(NotEvaluated):
 
 @dataclass(frozen=True)
 class ThermometerNotStated(NotEvaluated):
-    """Its uncertainty."""
+    """The uncertainty of the thermometer was not stated."""
 
 
 @dataclass(frozen=True)
 class SingleReading(NotEvaluated):
-    """The lack of fit of a single reading, ``cross_validated_g``: the budget
-    holds what that does to the parameters."""
+    """The lack of fit of a single reading, ``cross_validated_g``: the budget contains
+    its effect on the parameters."""
 
     cross_validated_g: float
 
@@ -245,21 +243,20 @@ class PosesWithoutScatter(NotEvaluated):
     """The noise of some poses is not known."""
 
 
-# What no recording can tell, and somebody has to state.
+# Values that no recording can determine.
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What no recording can tell, as standard uncertainties; None where nobody
-    stated it.
+    """Values that no recording can determine, as standard uncertainties; None where
+    not stated.
 
-    ``reference`` in the reference's unit, with what it rests on;
-    ``thermometer_k``; ``rounding`` the steps of the registers that take the
-    result, by parameter (`Calibration.parameters`), in its unit. ``not_held``
-    is the rms over the sphere by which what holds the result is off the whole
-    correction, in the reference's unit. ``thermal_sensitivity`` is by how much
-    a kelvin changes the bias of such units, in references, and their scale
-    factors, relatively.
+    ``reference`` in the reference's unit, with its basis; ``thermometer_k``;
+    ``rounding`` are the steps of the registers by parameter
+    (`Calibration.parameters`), in its unit. ``not_held`` is the rms difference over
+    the sphere between the device's correction and the whole one, in the reference's
+    unit. ``thermal_sensitivity`` is the change per kelvin of the bias of such units,
+    in references, and of their scale factors, relative.
     """
 
     reference: float | None = None
@@ -279,9 +276,9 @@ class Stated:
         thermometer_k: float | None = None,
         thermal_sensitivity: float | None = None,
     ) -> Stated:
-        """Where the reference is gravity by `triaxcal.model.gravity`: a stated
-        uncertainty, in g, comes before that of the formula. Without a place,
-        what is stated."""
+        """Values for a reference that is gravity by `triaxcal.model.gravity`: a
+        stated uncertainty, in g, takes precedence over that of the formula. Without a
+        place, the stated values."""
         if latitude_deg is None or height_m is None:
             return cls(reference, thermometer_k=thermometer_k, thermal_sensitivity=thermal_sensitivity)
         basis = StatedReference(latitude_deg, height_m, stated=reference is not None)

@@ -1,5 +1,5 @@
-"""What temperature does to the parameters: by effects that the model lacks, and
-by the thermometer of those it has."""
+"""Uncertainty from temperature: effects that the model lacks, and the thermometer of
+those that it has."""
 
 from __future__ import annotations
 
@@ -33,38 +33,38 @@ from triaxcal.uncertainty.statements import (
 )
 
 SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
-"""Standard deviation, before any data, of a coefficient that the fit has not
-taken up: in references per kelvin, and per kelvin. Typical of a mass-market
-MEMS accelerometer's data sheet; a navigation unit is ten times better."""
+"""Prior standard deviation of a coefficient that the fit lacks: in references per
+kelvin, and per kelvin. Typical of the data sheet of a mass-market MEMS accelerometer;
+a navigation unit is ten times better."""
 LARGEST = 3.0
-"""Of that standard deviation: a unit that is worse has another data sheet."""
+"""In that standard deviation: a worse unit has another data sheet."""
 NO_SENSITIVITY = 1e-12
-"""In place of a sensitivity of zero, whose inverse is infinite: it makes
-nothing that shows."""
+"""In place of a sensitivity of zero, whose inverse is infinite; its effect is
+negligible."""
 
 
 def temperature(
     calibration: Calibration, linearised: ErrorPropagation, stated: Stated
 ) -> tuple[list[Component], float]:
-    """What thermal effects that the fit has not taken up may have done to its
-    parameters; and the share of the residuals' variance beyond noise that they
-    do not explain, 0…1, lest it count twice.
+    """Effect on the parameters of thermal effects that the fit lacks, and the share
+    of the excess variance that they do not explain, 0…1, to avoid counting it twice.
 
-    A coefficient that did not show is not zero. Where the sensitivity of such
-    units was ``stated``, it is what the data leave of that, a mean and a spread
-    by Bayes' rule. Else an effect acts as probably, and as largely, as the
-    posterior of a diagnosis has it before any data, and the data leave so much
-    of that. The parameters of a fit without it are off by what it does to them.
+    A coefficient that did not show is not zero. With a ``stated`` sensitivity of such
+    units, its posterior mean and spread follow by Bayes' rule. Otherwise prior
+    probability and size of an effect are those of a diagnosis, updated by the data.
+    The parameters of a fit without the effect are biased by it.
     """
     if calibration.prior_sd is not None:
         return _as_probable(calibration, linearised), 1.0
     missing = _thermal_but(linearised.effects)
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
         return [], 1.0
+    # Coefficients in units of their prior widths, and their posterior.
     widths = [[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing]
     lacking = _Lacking.of(linearised, missing, np.concatenate(widths))
     known = stated.thermal_sensitivity is not None
     found = lacking.of_sensitivity if known else lacking.averaged(missing, _levels(calibration))
+    # Second moments about zero, mapped to the parameters.
     covariances = np.eye(len(found.mean)), lacking.of_sensitivity.within, _posterior(lacking.of_means), found.second
     of_parameters = [lacking.through @ c @ lacking.through.T for c in covariances]
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
@@ -82,9 +82,9 @@ def _levels(calibration: Calibration) -> NoiseLevels:
 
 @dataclass(frozen=True, eq=False)
 class _Coefficients:
-    """``mean`` (q,), the covariance ``within`` (q,q) that the data leave, and
-    the ``second`` moments (q,q) about zero; ``taken`` is how many of them the
-    data tell."""
+    """``mean`` (q,), the posterior covariance ``within`` (q,q), and the ``second``
+    moments (q,q) about zero; ``taken`` is the effective number of coefficients that
+    the data determine."""
 
     mean: Floats
     within: Floats
@@ -94,12 +94,11 @@ class _Coefficients:
 
 @dataclass(frozen=True, eq=False)
 class _Lacking:
-    """Effects that the model lacks, by coefficients (q,) in units of their
-    prior widths. ``misses`` (N,) are the residuals of the fit in standard
-    errors of their noise, ``columns`` (N,q) their derivatives, of which the
-    fitted parameters leave the ``rest``; ``through`` (p,q) is what a
-    coefficient does to these parameters, of which there are ``fitted``. The
-    first ``n`` rows are means."""
+    """Effects that the model lacks, with coefficients (q,) in units of their prior
+    widths. ``misses`` (N,) are the residuals of the fit in standard errors of their
+    noise, ``columns`` (N,q) their derivatives, ``rest`` the part that the fitted
+    parameters do not absorb; ``through`` (p,q) is the change of the ``fitted``
+    parameters by a unit of each coefficient. The first ``n`` rows are means."""
 
     misses: Floats
     columns: Floats
@@ -111,9 +110,11 @@ class _Lacking:
     @classmethod
     def of(cls, linearised: ErrorPropagation, effects: Sequence[Effect], widths: Floats) -> _Lacking:
         r, J, _ = linearise_all(linearised.problem, linearised.state.extended(effects))
-        # What residuals show beyond noise may be these very effects.
+        # Standard errors without the excess variance, which these effects may cause.
         s, p = linearised.noise, len(linearised.state.theta)
         columns = J[:, p:] * widths / s[:, None]
+        # Change of the fitted parameters by a unit of each coefficient, and the
+        # remainder.
         absorbed = linearised.gain @ (J[:, p:] * widths / linearised.error[:, None])
         rest = columns - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
         return cls(r / s, columns, rest, linearised.G @ absorbed[:p], len(linearised.problem.u), p)
@@ -124,10 +125,11 @@ class _Lacking:
 
     @cached_property
     def of_sensitivity(self) -> _Coefficients:
-        """With the prior's width as unit: what the poses do not show stays as
-        wide as it was. By the means alone: slopes know nothing of an effect
-        whose coefficients, and so its covariates' errors, are zero."""
+        """Posterior under a normal prior of unit width. Means alone: slopes have no
+        information on an effect whose coefficients, and with them its covariates'
+        errors, are zero."""
         rest = self.rest[: self.n]
+        # C = (1 + RᵀR)⁻¹ and mean = −C Rᵀ r.
         left = _posterior(rest)
         mean = -left @ rest.T @ self.misses[: self.n]
         # Fewer than coefficients where the data say little.
@@ -135,27 +137,30 @@ class _Lacking:
         return _Coefficients(mean, left, left + np.outer(mean, mean), taken)
 
     def averaged(self, effects: Sequence[Effect], levels: NoiseLevels) -> _Coefficients:
-        """Over which of the effects act, on which axes, and how large they are;
-        ``levels`` are those of the noise."""
+        """Posterior averaged over the hypotheses: which effects act, on which axes,
+        how large; ``levels`` are those of the noise."""
         log_prior, widths = map(np.array, zip(*_hypotheses(effects, self.of_means), strict=True))
         rest, misses = self.rest[: self.n], self.misses[: self.n]
+        # Eigenbasis of the information, in units of each hypothesis' widths.
         information, score = rest.T @ rest, -rest.T @ misses
         size, axes = np.linalg.eigh(widths[:, :, None] * information * widths[:, None])
         size = np.maximum(size, 0.0)
         axes = widths[:, :, None] * axes
         along = np.einsum("hqr,q->hr", axes, score) / (1 + size)
+        # Chi-square at the posterior mean, evidence, and posterior probability.
         chi2 = float(misses @ misses) - np.sum(along**2 * (1 + size), axis=1)
         left = max(self.n - self.fitted, 1)
         log = log_prior + levels.log_likelihood(chi2, left) - 0.5 * np.log1p(size).sum(axis=1)
         share = softmax(log)
+        # Law of total covariance over the hypotheses.
         mean = np.einsum("hqr,hr->hq", axes, along)
         within = np.einsum("h,hqr,hr,hpr->qp", share, axes, 1 / (1 + size), axes)
         second = within + np.einsum("h,hq,hp->qp", share, mean, mean)
         return _Coefficients(share @ mean, within, second, float(share @ np.sum(size / (1 + size), axis=1)))
 
     def unexplained(self, found: _Coefficients, fitted: int) -> float:
-        """The share of the residuals' variance beyond noise that is no such
-        effect, 0…1; ``fitted`` parameters took their degrees of freedom."""
+        """Share of the excess variance that these effects do not explain, 0…1;
+        ``fitted`` parameters took their degrees of freedom."""
         before, after = (
             float(v @ v) / max(len(v) - fitted - dof, 1e-9)
             for v, dof in ((self.misses, 0.0), (self.misses + self.rest @ found.mean, found.taken))
@@ -164,10 +169,10 @@ class _Lacking:
 
 
 def _hypotheses(effects: Sequence[Effect], columns: Floats) -> Iterator[tuple[float, Floats]]:
-    """Nothing, each effect on some axes and of some size, and all of them on all
-    axes: the logarithm of its prior, and the widths (q,) of the coefficients in
-    units of the typical sensitivity. ``columns`` (n,q) are what they then do to
-    the means, over the noise."""
+    """Hypotheses: nothing, each effect on some axes with some size, and all effects
+    on all axes. Each with its log prior and the widths (q,) of the coefficients in
+    units of the typical sensitivity. ``columns`` (n,q) are their effects on the
+    means, over the noise."""
     odds = EFFECT_ODDS / len(CATALOGUE)
     ends = np.cumsum([0, *(len(e.coefficients) for e in effects)])
     yield 0.0, np.zeros(ends[-1])
@@ -189,8 +194,8 @@ def _hypotheses(effects: Sequence[Effect], columns: Floats) -> Iterator[tuple[fl
 
 
 def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list[Component]:
-    """By the probability of each thermal effect and of its sizes, as the poses
-    and what happens inside them tell."""
+    """The component from the posterior of a diagnosis: probabilities of the thermal
+    effects and of their sizes."""
     if calibration.thermal is None or not calibration.thermal.any():
         return []
     present = {e.name for e in linearised.effects}
@@ -201,10 +206,9 @@ def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list
 
 
 def _posterior(Z: Floats) -> Floats:
-    """Covariance that the data leave of coefficients of which ``Z`` (n,q) is
-    what each does to the residuals, in units of the coefficients' prior widths
-    and of the residuals' errors: (I + Zᵀ Z)⁻¹, also where Zᵀ Z has no inverse
-    left beside it in floating point."""
+    """Posterior covariance (1 + ZᵀZ)⁻¹ of coefficients of unit prior width, for ``Z``
+    (n,q) in standard errors of the residuals; by SVD, so that it is accurate for any
+    ZᵀZ."""
     _, size, axes = np.linalg.svd(Z)
     left = np.ones(Z.shape[1])
     left[: len(size)] = (1 / np.hypot(1.0, size)) ** 2  # s² itself might overflow
@@ -214,9 +218,9 @@ def _posterior(Z: Floats) -> Floats:
 def _halved_by(
     calibration: Calibration, names: tuple[str, ...], prior: float, left: float, apart: float, whole: float
 ) -> Remedy:
-    """As magnitudes: what the ``prior`` makes, what the data leave of it, what
-    they would leave were the parameters known (so that nothing takes an effect
-    for them), and the ``whole`` component, which has the effects' means too."""
+    """The remedy, from magnitudes: the ``prior`` one, the posterior one (``left``),
+    the posterior one with known parameters (``apart``), and the ``whole`` component
+    with the effects' means."""
     identifiable, p = 2 * left < prior, calibration.residual.lack_of_fit_p
     if identifiable and 2 * left < whole and p is not None and p < LACK_OF_FIT:
         return TemperatureModelled(names)
@@ -240,8 +244,8 @@ def _sensitivity(effect: Effect, reference: float, stated: Stated) -> float:
 
 
 def thermometer(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> list[Component]:
-    """With thermal effects in the model its values hold at a temperature that
-    somebody has to measure."""
+    """With thermal effects in the model, its values hold at a temperature that has to
+    be measured."""
     if not stated.thermometer_k or not needs_temperature(linearised.effects):
         return []
     shift = linearised.when_shifted(calibration, TEMPERATURE, stated.thermometer_k)

@@ -17,7 +17,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import residuals_by_run, shape_by_poses, shape_of, together
+from triaxcal.estimate.recordings import residuals_by_run, shape_by_poses, shape_of
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
 from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
@@ -336,7 +336,7 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
     return replace(
         first,
         name=f"{first.name} and {len(recordings) - 1} more",
-        poses=together([m.poses for m in recordings]),
+        poses=gather([m.poses for m in recordings]),
         windows=None,
         unconfirmed=first.unconfirmed if all(m.unconfirmed for m in recordings) else "",
         data_quality=[line for m in recordings for line in named_quality(m)],

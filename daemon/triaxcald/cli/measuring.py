@@ -14,7 +14,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import magnitude_errors
-from triaxcal.estimate.recordings import shape_beside, shape_in
+from triaxcal.estimate.recordings import shape_in, shape_without_effects
 from triaxcal.interchange.calibration_document import poses_document
 from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.rounding import error
@@ -77,7 +77,7 @@ def verify_command(a: argparse.Namespace) -> int:
     warnings = unlike(measured.name, found.rms_g, reference)
     if not warnings:
         held = shape_in(calibration_part(document, where=a.calibration))
-        warnings = other_unit(a.calibration, measured.name, held, shape_beside(model, measured.poses))
+        warnings = other_unit(a.calibration, measured.name, held, shape_without_effects(model, measured.poses))
     warnings += _of_its_recording(model, a.calibration)
     result = {
         "format": "triaxcal.verify/1",

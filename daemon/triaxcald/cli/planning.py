@@ -25,7 +25,15 @@ from triaxcal.model.directions import (
     worst_error,
 )
 from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
-from triaxcal.planning.design import Asked, Sight, ask, in_plan, needs_time, sight, unseen_effects
+from triaxcal.planning.design import (
+    Observability,
+    TargetEffects,
+    in_plan,
+    needs_time,
+    observability,
+    target_effects,
+    unseen_effects,
+)
 from triaxcal.planning.optimal import OptimalPlan, optimal
 from triaxcal.rounding import number, numbers, uncertainty
 from triaxcal.text.advice import to_move
@@ -94,14 +102,14 @@ def _plain_plan(a: argparse.Namespace) -> int:
 def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
     found = optimal(a.poses or _enough_for(effects), effects)
     plan = list(found.plan)
-    others = [e for e in CATALOGUE if e.name not in [asked.name for asked in effects]]
+    others = [e for e in CATALOGUE if e.name not in [targets.name for targets in effects]]
     document = _document(plan, _sights(plan, [*effects, *others], found.levels))
     for i, pose in enumerate(document["poses"]):
         if found.levels:
             pose["levels"] = {name: number(float(v[i])) for name, v in found.levels.items()}
     document |= {
         "for": [e.name for e in effects],
-        "together": _together(found.asked),
+        "together": _together(found.targets),
         "efficiency": uncertainty(found.efficiency),
         "promised": _errors(found.errors),
         "moves": _moves(found),
@@ -126,7 +134,7 @@ def _enough_for(effects: Sequence[Effect]) -> int:
     have more coefficients than it poses."""
     names = {e.name for e in effects}
     plain = (n for n in (PAPER, FULL) if not names & set(unseen_effects(_ups(closed(directions(n))), effects)))
-    return max(next(plain, FULL), LEAST + ask(effects).rank)
+    return max(next(plain, FULL), LEAST + target_effects(effects).rank)
 
 
 def _ups(plan: Sequence[Direction]) -> Floats:
@@ -135,11 +143,11 @@ def _ups(plan: Sequence[Direction]) -> Floats:
 
 def _sights(
     plan: Sequence[Direction], effects: Sequence[Effect], held: Mapping[str, Floats] | None = None
-) -> dict[str, Sight]:
-    return {e.name: sight(_ups(plan), e, held) for e in effects}
+) -> dict[str, Observability]:
+    return {e.name: observability(_ups(plan), e, held) for e in effects}
 
 
-def _document(plan: Sequence[Direction], sights: Mapping[str, Sight]) -> Document:
+def _document(plan: Sequence[Direction], observabilities: Mapping[str, Observability]) -> Document:
     poses: list[Document] = [{"label": label, "up": numbers(v)} for label, v in plan]
     poses[-1]["repeat"] = True
     return {
@@ -148,26 +156,26 @@ def _document(plan: Sequence[Direction], sights: Mapping[str, Sight]) -> Documen
         "directions": len(plan) - 1,
         "dilution": number(dilution(ups := _ups(plan))),
         "worst_standard_error": number(worst_error(linear_design(ups, ups))),
-        **_seen(sights),
+        **_seen(observabilities),
     }
 
 
-def _seen(sights: Mapping[str, Sight]) -> Document:
+def _seen(observabilities: Mapping[str, Observability]) -> Document:
     return {
-        "blind_to": [name for name, s in sights.items() if s.visible < s.of],
+        "blind_to": [name for name, s in observabilities.items() if s.visible < s.of],
         "sees": {
             name: {
                 "visible": s.visible,
                 "of": s.of,
                 "hidden": [{"coefficients": {k: uncertainty(w) for k, w in h.items()}} for h in s.hidden],
             }
-            for name, s in sights.items()
+            for name, s in observabilities.items()
         },
     }
 
 
-def _together(asked: Asked) -> Document:
-    return {"visible": asked.rank, "of": len(asked.seen)}
+def _together(targets: TargetEffects) -> Document:
+    return {"visible": targets.rank, "of": len(targets.seen)}
 
 
 def _errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None = 1.0) -> Document:
@@ -186,7 +194,7 @@ def _moves(found: OptimalPlan) -> dict[str, str]:
             steps.append(f"{_level(level)} for poses {at} to {at + size - 1}" if size > 1 else f"{_level(level)} {at}")
             at += size
         out[name] = f"over as wide a range as can be had: {', '.join(steps)}"
-    if needs_time(found.asked.effects):
+    if needs_time(found.targets.effects):
         out[TIME] = "the poses at even intervals and in this order, the first again at the end"
     return out
 
@@ -216,18 +224,20 @@ def _never_seen(document: Document) -> list[str]:
 def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
     measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
-    had = [p for p in measured.poses if not p.fault]
+    existing = [p for p in measured.poses if not p.fault]
     with telling_data_quality(measured):
-        found = missing_poses(had, effects, signs=choice.signs, reference=choice.reference)
-    sights = None if found.had is None else {e.name: sight(found.had.up, e) for e in CATALOGUE}
+        found = missing_poses(existing, effects, signs=choice.signs, reference=choice.reference)
+    observabilities = (
+        None if found.existing is None else {e.name: observability(found.existing.up, e) for e in CATALOGUE}
+    )
     document: Document = {
         "format": "triaxcal.plan/1",
-        "have": len(had),
-        "left_out": len(measured.poses) - len(had),
+        "have": len(existing),
+        "left_out": len(measured.poses) - len(existing),
         "dilution": number(found.dilution),
-        "worst_standard_error": None if found.had is None else number(found.had.worst_error),
+        "worst_standard_error": None if found.existing is None else number(found.existing.worst_error),
         "noise_g": uncertainty(found.noise),
-        **(_seen(sights) if sights else {"blind_to": None, "sees": None}),
+        **(_seen(observabilities) if observabilities else {"blind_to": None, "sees": None}),
         "poses": [_added(found, pose) for pose in found.wanted],
     }
     if effects:
@@ -243,7 +253,7 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
         return 0
     if document["left_out"]:
         show(f"{measured.name}: {counted(len(measured.poses), document['left_out'])}")
-    title = f"the {len(had)} of {measured.name}"
+    title = f"the {len(existing)} of {measured.name}"
     if found.wanted:
         _show_wanted(f"poses worth adding to {title}", found)
     elif not found.absent:
@@ -256,8 +266,8 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
         show(why)
     for name, channel in found.moves.items():
         show(f"{name}: {to_move(channel)}")
-    if sights is not None:
-        show(f"the {len(had)} there are cannot show: {_list(document['blind_to'])}")
+    if observabilities is not None:
+        show(f"the {len(existing)} there are cannot show: {_list(document['blind_to'])}")
     warn(measured.data_quality)
     return 0
 
@@ -294,7 +304,7 @@ def _not_shown(found: MissingPoses, effects: Sequence[Effect]) -> dict[str, str]
         missing = [c for c, e in _of_all([effect], found.now)[effect.name].items() if e is None]
         if lost:
             out[effect.name] = f"{effect.name}: cannot show, since the recording has no channel {', '.join(lost)}"
-        elif missing and found.had is not None:
+        elif missing and found.existing is not None:
             then = found.wanted[-1].errors.get(effect.name, {}) if found.wanted else {}
             never = [c for c in missing if then.get(c) is None]
             after = "; nor with the poses to add" if never == missing else "; with the poses to add they can"

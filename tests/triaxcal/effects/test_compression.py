@@ -16,7 +16,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.findings import NotIdentifiable, Why
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.design import sight
+from triaxcal.planning.design import observability
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
@@ -96,8 +96,8 @@ def test_poses_without_edges_say_that_they_show_the_sum_of_both_ends_alone(
     fourteen: np.ndarray, twenty_six: np.ndarray, with_effect: Callable[[Effect, Sequence[float]], Sensor]
 ) -> None:
     odd, even = Compression("odd"), Compression("even")
-    assert (sight(fourteen, odd).visible, sight(fourteen, even).visible) == (1, 3)
-    assert (sight(twenty_six, odd).visible, sight(twenty_six, even).visible) == (3, 3)
+    assert (observability(fourteen, odd).visible, observability(fourteen, even).visible) == (1, 3)
+    assert (observability(twenty_six, odd).visible, observability(twenty_six, even).visible) == (3, 3)
 
 
 def test_poses_in_few_directions_say_that_they_cannot_show_it(

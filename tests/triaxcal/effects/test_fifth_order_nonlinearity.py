@@ -14,7 +14,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.findings import NotIdentifiable, Why
 from triaxcal.model.directions import directions, linear_design
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.design import combinations, radial, sight
+from triaxcal.planning.design import combinations, observability, radial
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
@@ -51,7 +51,7 @@ def test_poses_without_edges_say_that_they_show_its_sum_alone(
     fourteen: np.ndarray, twenty_six: np.ndarray, with_effect: Callable[[Effect, Sequence[float]], Sensor]
 ) -> None:
     effect = FifthOrderNonlinearity()
-    assert (sight(fourteen, effect).visible, sight(twenty_six, effect).visible) == (1, 3)
+    assert (observability(fourteen, effect).visible, observability(twenty_six, effect).visible) == (1, 3)
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), fourteen, 1.5e-5, np.random.default_rng(0))
     loop = diagnose(poses, signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import TIME, effect_named
-from triaxcal.estimate.calibration import Calibration, HoldsAt
+from triaxcal.estimate.calibration import Calibration, ReferenceEpoch
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.projected_calibration import reduced
 from triaxcal.model.directions import directions
@@ -80,7 +80,7 @@ def test_what_remains_is_as_little_as_any_nine_parameters_could_leave(fitted: Ca
 def test_an_effect_of_time_is_held_as_the_bias_at_the_moment(fitted: Callable[..., Calibration]) -> None:
     whole = fitted(bias_drift=[5e-7, -4e-7, 3e-7])
     end_s = max(p.pose.end_s for p in whole.poses)
-    held = replace(whole, holds_at=HoldsAt(Moment.END, end_s, end_s))
+    held = replace(whole, holds_at=ReferenceEpoch(Moment.END, end_s, end_s))
     found = reduced(held, lambda effect: False)
     ((_, rate),) = whole.sensor.effects
     drift = rate * (end_s - whole.channel_reference[TIME])

@@ -19,7 +19,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import solve
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import ByRun, by_run, residuals_by_run, together
+from triaxcal.estimate.recordings import ByRun, by_run, gather, residuals_by_run
 from triaxcal.model.directions import directions
 from triaxcal.poses.covariates import channels_of, covariates_elsewhere
 from triaxcal.poses.pose import Pose, PoseStart, Run
@@ -57,7 +57,7 @@ def recording(
 @pytest.fixture(scope="module")
 def three() -> list[Pose]:
     rng = np.random.default_rng(1)
-    return together([recording(rng, count=14) for _ in range(3)])
+    return gather([recording(rng, count=14) for _ in range(3)])
 
 
 # What belongs to a run
@@ -65,7 +65,7 @@ def three() -> list[Pose]:
 
 def test_one_recording_stays_as_it_is_and_is_searched_as_ever() -> None:
     poses = recording(np.random.default_rng(0))
-    assert together([poses]) == poses
+    assert gather([poses]) == poses
     assert by_run(CATALOGUE, poses) == CATALOGUE
     assert RUN not in channels_of(poses)
     assert poses[3].began == PoseStart(30.0)
@@ -90,7 +90,7 @@ def test_a_fit_that_runs_away_on_poses_of_two_units_is_refused() -> None:
     for seed in range(6):
         rng = np.random.default_rng(seed)
         other = [replace(p, mean=1.15 * p.mean) for p in recording(rng, count=9)]
-        poses = together([recording(rng, count=9), other])
+        poses = gather([recording(rng, count=9), other])
         problem = problem_of(poses, signs=SIGNS, reference=1.0)
         with pytest.raises(Refused, match="the fit ran away"):
             solve(problem, start(problem, poses, SIGNS), (third,))
@@ -98,7 +98,7 @@ def test_a_fit_that_runs_away_on_poses_of_two_units_is_refused() -> None:
 
 def test_a_recording_without_a_pose_is_named() -> None:
     with pytest.raises(InvalidData, match="recording 2 of 2 has no still pose"):
-        together([recording(np.random.default_rng(0)), []])
+        gather([recording(np.random.default_rng(0)), []])
 
 
 # Effects run by run
@@ -187,7 +187,7 @@ def test_coefficients_and_standard_errors_of_three_runs_are_right_over_many_seed
             recording(rng, lambda t: shifts[1] + slope * (t - middle)[:, None], square=square),
             recording(rng, lambda t: shifts[2] + 0 * t[:, None], square=square),
         ]
-        found = fit(together(runs), signs=SIGNS, effects=effects, excluded=())
+        found = fit(gather(runs), signs=SIGNS, effects=effects, excluded=())
         off = found.values - truth
         chi2 += float(off @ np.linalg.solve(found.covariance / found.birge_ratio**2, off))
     low, high = stats.chi2.ppf([0.0005, 0.9995], len(truth) * seeds)
@@ -203,7 +203,7 @@ def test_the_loop_finds_a_square_term_of_the_unit_a_drift_of_one_run_and_the_run
         recording(rng, square=square),
         recording(rng, lambda t: shift + slope * (t - 130.0)[:, None], square=square),
     ]
-    loop = diagnose(together(runs), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(gather(runs), signs=SIGNS, catalogue=FEW)
     found = {f.effect: f for f in loop.findings}
     assert any("second_order_nonlinearity" in (f.effect, *f.alternatives) for f in loop.findings)
     assert "run_bias" in found
@@ -219,7 +219,7 @@ def test_runs_that_come_back_with_another_bias_show_that_and_nothing_else() -> N
     rng = np.random.default_rng(5)
     shifts = [1e-4 * rng.standard_normal(3) for _ in range(3)]
     runs = [recording(rng, lambda t, b=b: b + 0 * t[:, None], count=14) for b in shifts]  # type: ignore[misc]
-    loop = diagnose(together(runs), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(gather(runs), signs=SIGNS, catalogue=FEW)
     assert [f.effect for f in loop.findings] == ["run_bias"]
     mean = np.mean(shifts, axis=0)
     first = loop.after.sensor.bias - BIAS
@@ -233,7 +233,7 @@ def test_a_drift_that_is_alike_in_all_runs_has_one_slope() -> None:
     rng = np.random.default_rng(7)
     slope = np.array([2e-6, -1e-6, 2e-6])
     runs = [recording(rng, lambda t: slope * (t - 70.0)[:, None], count=14) for _ in range(3)]
-    loop = diagnose(together(runs), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(gather(runs), signs=SIGNS, catalogue=FEW)
     assert [f.effect for f in loop.findings] == ["bias_drift"]
     for axis, value in zip("xyz", slope, strict=True):
         got, error, _ = loop.findings[0].coefficients[axis]
@@ -245,7 +245,7 @@ def test_a_drift_that_is_alike_in_all_runs_has_one_slope() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_is_found_where_runs_differ_in_nothing(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
-    loop = diagnose(together([recording(rng, count=14) for _ in range(2)]), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(gather([recording(rng, count=14) for _ in range(2)]), signs=SIGNS, catalogue=FEW)
     assert loop.findings == ()
 
 
@@ -254,7 +254,7 @@ def test_a_scale_factor_that_differs_from_run_to_run_is_named() -> None:
     rng = np.random.default_rng(8)
     first, second = recording(rng, count=14), recording(rng, count=14)
     other = [replace(p, mean=p.mean + (p.mean - K * BIAS) * [2e-4, -2e-4, 1e-4]) for p in second]
-    loop = diagnose(together([first, other]), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(gather([first, other]), signs=SIGNS, catalogue=FEW)
     assert [f.effect for f in loop.findings] == ["run_scale_factor"]
     # Half of it on either side of the mean.
     for axis, value in zip("xyz", [1e-4, -1e-4, 0.5e-4], strict=True):
@@ -267,7 +267,7 @@ def test_a_scale_factor_that_differs_from_run_to_run_is_named() -> None:
 def test_the_residual_by_run_is_the_rms_over_its_poses() -> None:
     rng = np.random.default_rng(4)
     runs = [recording(rng, count=14), recording(rng, lambda t: np.outer(t, [2e-6, 0, 0]), count=18)]
-    loop = diagnose(together(runs), signs=SIGNS, catalogue=(BiasDrift(),))
+    loop = diagnose(gather(runs), signs=SIGNS, catalogue=(BiasDrift(),))
     first, second = residuals_by_run(loop.before, loop.after)
     assert (first.poses, second.poses) == (14, 18)
     off = [p.residual_g for p in loop.after.poses]

@@ -10,7 +10,7 @@ import pytest
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import Shape, shape_beside, shape_by_poses, shape_in, shape_of
+from triaxcal.estimate.recordings import Shape, shape_by_poses, shape_in, shape_of, shape_without_effects
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -118,9 +118,9 @@ def test_what_a_calibration_corrects_is_not_asked_about() -> None:
     unit = Sensor(np.array([2.41, 2.40, 2.37]), np.array([6e-3, 4e-3, -6e-4]), np.zeros(3), effects)
     held = fit(_recorded(unit, 0), effects=[e for e, _ in effects])
     for seed in range(1, 11):
-        assert not _asked(shape_of(held), shape_beside(held, _recorded(unit, seed, poses=14, temp_c=100.0)))
+        assert not _asked(shape_of(held), shape_without_effects(held, _recorded(unit, seed, poses=14, temp_c=100.0)))
     other = replace(unit, misalignment=unit.misalignment + np.array([8e-3, 0.0, -5e-3]))
-    assert _asked(shape_of(held), shape_beside(held, _recorded(other, 1, poses=14, temp_c=100.0)))
+    assert _asked(shape_of(held), shape_without_effects(held, _recorded(other, 1, poses=14, temp_c=100.0)))
 
 
 def test_a_recording_of_few_poses_has_no_shape_to_ask_about() -> None:

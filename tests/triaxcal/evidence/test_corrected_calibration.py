@@ -9,7 +9,7 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
-from triaxcal.estimate.calibration import Calibration, HoldsAt
+from triaxcal.estimate.calibration import Calibration, ReferenceEpoch
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
 from triaxcal.evidence.corrected_calibration import corrected
@@ -21,7 +21,7 @@ from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.propagation import Extrapolated
 
 Poses = Callable[..., list[Pose]]
-START = HoldsAt(Moment.SECONDS, 0.0, 0.0)
+START = ReferenceEpoch(Moment.SECONDS, 0.0, 0.0)
 
 
 def of(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> tuple[Calibration, Calibration]:
@@ -103,7 +103,7 @@ def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
         before = fit(poses, signs=MINUS)
         posterior = posterior_of(poses, before, signs=MINUS, catalogue=FEW)
         inside, after = (
-            corrected(before, posterior, HoldsAt(Moment.SECONDS, t_s, t_s))[0]
+            corrected(before, posterior, ReferenceEpoch(Moment.SECONDS, t_s, t_s))[0]
             for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
         )
         assert not [c for c in inside.cautions if isinstance(c, Extrapolated)]

@@ -10,7 +10,7 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
-from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Average, Posterior, Refusal, average, posterior_of, refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
@@ -23,8 +23,8 @@ def seen_in(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Posterior:
     return posterior_of(poses, fit(poses, signs=signs), signs=signs, catalogue=FEW)
 
 
-def at(t_s: float) -> HoldsAt:
-    return HoldsAt(Moment.SECONDS, t_s, t_s)
+def at(t_s: float) -> ReferenceEpoch:
+    return ReferenceEpoch(Moment.SECONDS, t_s, t_s)
 
 
 def errors_of(made: Sensor, truth: Sensor) -> np.ndarray:

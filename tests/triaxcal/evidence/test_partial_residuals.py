@@ -15,7 +15,7 @@ from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.nonlinear import CrossCoupling
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import together
+from triaxcal.estimate.recordings import gather
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.partial_residuals import (
     PANELS,
@@ -268,7 +268,7 @@ def test_an_effect_of_one_of_several_recordings_is_drawn_over_that_one(poses_wit
     from triaxcal.effects.runs import InRuns
 
     effect = InRuns(effect_named("bias_drift"), (1,))
-    poses = together([poses_with(1), poses_with(2, bias_drift=[6e-6, -6e-6, 6e-6])])
+    poses = gather([poses_with(1), poses_with(2, bias_drift=[6e-6, -6e-6, 6e-6])])
     rows, c = traced(poses, effect)
     for trace in of_effect(rows, c, "bias_drift"):
         assert set(trace.pose) <= set(range(30, 60))

@@ -17,7 +17,7 @@ from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import solve
 from triaxcal.model.directions import cube_directions, dilution, directions, distinct
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.design import ask
+from triaxcal.planning.design import target_effects
 from triaxcal.planning.optimal import OptimalPlan, bound, optimal
 from triaxcal.synthetic import noisy_poses
 
@@ -53,13 +53,15 @@ def covariates(plan: OptimalPlan) -> dict[str, np.ndarray]:
 def test_the_bound_for_a_bias_that_goes_with_temperature_is_what_theory_says() -> None:
     # The three coefficients share an information of T² |a|² ≤ 1 a pose; the determinant is largest where they do so
     # evenly, and at the two ends of the range they can be at right angles to all nine parameters.
-    assert bound(ask([WARM]), 21) == pytest.approx(3 * np.log(1 / 3), abs=0.01)
+    assert bound(target_effects([WARM]), 21) == pytest.approx(3 * np.log(1 / 3), abs=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [15, 27])
 def test_the_bound_for_drift_counts_time_as_it_passes(n: int) -> None:
-    assert bound(ask([DRIFT]), n) == pytest.approx(3 * np.log(np.mean(np.linspace(-1, 1, n) ** 2) / 3), abs=0.01)
+    assert bound(target_effects([DRIFT]), n) == pytest.approx(
+        3 * np.log(np.mean(np.linspace(-1, 1, n) ** 2) / 3), abs=0.01
+    )
 
 
 @pytest.mark.slow
@@ -79,7 +81,7 @@ def test_the_bound_is_the_optimum_that_another_algorithm_finds(effects: list[Eff
         weight *= 1 - 1 / (step + 2 + 50)
         weight[np.argmax(variance)] += 1 / (step + 2 + 50)
     reached = float(np.linalg.slogdet(M)[1] - np.linalg.slogdet(M[:9, :9])[1])
-    limit = bound(ask(effects), 27)
+    limit = bound(target_effects(effects), 27)
     assert reached <= limit + 1e-6
     assert reached == pytest.approx(limit, abs=0.03 * q)
 
@@ -129,7 +131,7 @@ def test_it_beats_the_plain_plan_of_as_many_poses_and_keeps_the_nine_parameters_
     assert dilution(found.ups) <= 1.5 * dilution(plain[:-1]) * (1 + 1e-9)
     assert distinct(found.ups, apart_deg=9.999) == count
     assert np.array_equal(found.ups[0], found.ups[-1])
-    claimed = np.exp((value(found.ups) - 3 * np.log(count + 1) - bound(found.asked, count + 1)) / 3)
+    claimed = np.exp((value(found.ups) - 3 * np.log(count + 1) - bound(found.targets, count + 1)) / 3)
     assert found.efficiency == pytest.approx(claimed, rel=1e-6)
     assert 0.75 < found.efficiency <= 1
 
@@ -242,8 +244,8 @@ def test_what_the_nine_parameters_absorb_is_refused_whatever_the_plan() -> None:
 @pytest.mark.slow
 def test_of_an_effect_of_which_a_part_shows_that_part_is_planned_for() -> None:
     found = optimal(20, [Swirl()])
-    assert found.asked.rank == 1
-    assert np.abs(found.asked.hidden[:, 0]) == pytest.approx([1.0, 0.0], abs=1e-9)
+    assert found.targets.rank == 1
+    assert np.abs(found.targets.hidden[:, 0]) == pytest.approx([1.0, 0.0], abs=1e-9)
     assert found.errors["swirl"]["turn"] is None
     assert found.errors["swirl"]["bend"] is not None
 
@@ -251,7 +253,7 @@ def test_of_an_effect_of_which_a_part_shows_that_part_is_planned_for() -> None:
 @pytest.mark.slow
 def test_effects_that_share_a_part_leave_it_open_whose_it_is() -> None:
     found = optimal(16, [WARM, BENT])
-    assert found.asked.rank == 6
+    assert found.targets.rank == 6
     assert all(v is None for v in found.errors["temperature_bias"].values())
     assert all(found.errors["temperature_bias_quadratic"][f"quadratic_{axis}"] is not None for axis in "xyz")
 
@@ -268,4 +270,4 @@ def test_fewer_poses_than_parameters_are_refused_with_the_number_that_it_takes()
 @pytest.mark.slow
 def test_every_effect_of_the_catalogue_can_show_all_of_itself() -> None:
     for effect in CATALOGUE:
-        assert ask([effect]).rank == len(effect.coefficients)
+        assert target_effects([effect]).rank == len(effect.coefficients)

@@ -11,7 +11,7 @@ import pytest
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
 from triaxcal.model.directions import directions
-from triaxcal.planning.design import sight, unseen_effects
+from triaxcal.planning.design import observability, unseen_effects
 
 
 def test_fourteen_poses_show_the_second_order_but_not_the_third(fourteen: np.ndarray) -> None:
@@ -22,11 +22,11 @@ def test_fourteen_poses_show_the_second_order_but_not_the_third(fourteen: np.nda
 
 def test_of_the_third_order_fourteen_poses_show_the_sum_alone(fourteen: np.ndarray) -> None:
     # METHOD §5: a⁴ takes two values on these directions, and x⁴ + y⁴ + z⁴ tells faces from vertices.
-    third = sight(fourteen, effect_named("third_order_nonlinearity"))
+    third = observability(fourteen, effect_named("third_order_nonlinearity"))
     assert (third.visible, third.of, len(third.hidden)) == (1, 3, 2)
     for combination in third.hidden:
         assert sum(combination.values()) == pytest.approx(0, abs=1e-9)
-    assert sight(fourteen, effect_named("second_order_nonlinearity")).hidden == ()
+    assert observability(fourteen, effect_named("second_order_nonlinearity")).hidden == ()
 
 
 @pytest.mark.parametrize("name", ["second_order_nonlinearity", "third_order_nonlinearity", "bias_drift"])
@@ -41,7 +41,7 @@ def test_what_is_hidden_changes_no_fit_and_what_is_visible_does(name: str, count
     x, y, z = a.T
     q, _ = np.linalg.qr(np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z], axis=1))
     rest = columns - q @ (q.T @ columns)
-    found = sight(a, effect)
+    found = observability(a, effect)
     assert found.visible == np.linalg.matrix_rank(rest, tol=0.02)
     assert found.visible + len(found.hidden) == found.of
     for combination in found.hidden:
@@ -64,7 +64,7 @@ class Half(type(effect_named("second_order_nonlinearity"))):  # type: ignore[mis
 
 
 def test_a_coefficient_that_does_nothing_does_not_hide_the_others(twenty_six: np.ndarray) -> None:
-    found = sight(twenty_six, Half())
+    found = observability(twenty_six, Half())
     assert (found.visible, found.hidden) == (2, ({"y": 1.0},))
 
 

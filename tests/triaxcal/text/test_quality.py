@@ -10,12 +10,12 @@ from triaxcal.poses.quality.finding import (
     Disturbance,
     DisturbedPoses,
     DuplicateSamples,
-    Finding,
     Freeze,
     MainsPickup,
     MergedPoses,
     MissingSamples,
     Move,
+    QualityFinding,
     Saturation,
     SlowUpdate,
     Steps,
@@ -26,7 +26,7 @@ from triaxcal.poses.quality.finding import (
 from triaxcal.text import quality, quality_line
 
 TWO = Touched((1, 4), (5.02, 20.0))
-LINES: list[tuple[Finding, str]] = [
+LINES: list[tuple[QualityFinding, str]] = [
     (
         Saturation((AtRail("x", 2.4931, 812, 5.1, TWO), AtRail("y", -32768.0, 1, 4.5, Touched()))),
         "saturation: x at 2.4931 in 812 samples, first at 5.1 s, in the poses that begin at 5.0, 20.0 s: take again; "
@@ -81,7 +81,7 @@ LINES: list[tuple[Finding, str]] = [
 
 
 @pytest.mark.parametrize(("found", "line"), LINES, ids=lambda v: type(v).__name__)
-def test_a_finding_is_said_with_its_figures_in_the_unit_of_the_outputs(found: Finding, line: str) -> None:
+def test_a_finding_is_said_with_its_figures_in_the_unit_of_the_outputs(found: QualityFinding, line: str) -> None:
     assert quality_line(found, "V") == line
 
 
@@ -96,4 +96,4 @@ def test_many_poses_are_counted_behind_the_first_eight() -> None:
 
 
 def test_every_kind_of_finding_has_words() -> None:
-    assert {type(found) for found, _ in LINES} == set(Finding.__subclasses__())
+    assert {type(found) for found, _ in LINES} == set(QualityFinding.__subclasses__())

@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.effects import Effect, effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import by_run, together
+from triaxcal.estimate.recordings import by_run, gather
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import channels_of, covariates, references
@@ -46,7 +46,7 @@ def test_a_type_of_unit_may_be_known_to_start_alike(paper_unit: Sensor) -> None:
 def test_of_several_recordings_the_start_is_measured(paper_unit: Sensor) -> None:
     told = []
     for seed in range(8):
-        poses = together([run_of(paper_unit, 100 * seed + k, start_g=5e-4) for k in range(5)])
+        poses = gather([run_of(paper_unit, 100 * seed + k, start_g=5e-4) for k in range(5)])
         c = fit(poses, signs=MINUS, excluded=())
         found = next_recording(c, budget(c))
         assert found.source is Source.MEASURED
@@ -55,12 +55,12 @@ def test_of_several_recordings_the_start_is_measured(paper_unit: Sensor) -> None
 
 
 def test_recordings_that_start_alike_say_so(paper_unit: Sensor) -> None:
-    c = fit(together([run_of(paper_unit, k) for k in range(4)]), signs=MINUS)
+    c = fit(gather([run_of(paper_unit, k) for k in range(4)]), signs=MINUS)
     assert next_recording(c, budget(c)).start_to_start < 1e-5
 
 
 def test_few_recordings_widen_the_interval(paper_unit: Sensor) -> None:
-    two = fit(together([run_of(paper_unit, k, start_g=5e-4) for k in range(2)]), signs=MINUS, excluded=())
+    two = fit(gather([run_of(paper_unit, k, start_g=5e-4) for k in range(2)]), signs=MINUS, excluded=())
     found = next_recording(two, budget(two))
     assert found.expanded_uncertainty > 2.5 * found.start_to_start
 
@@ -70,7 +70,7 @@ def test_errors_in_the_next_recording_stay_within_what_is_stated(paper_unit: Sen
     within = []
     for seed in range(30):
         runs = [run_of(paper_unit, 50 * seed + k, start_g=4e-4) for k in range(5)]
-        c = fit(together(runs[:4]), signs=MINUS, excluded=())
+        c = fit(gather(runs[:4]), signs=MINUS, excluded=())
         stated = next_recording(c, budget(c)).expanded_uncertainty
         u = np.array([p.mean for p in runs[4]])
         off = np.linalg.norm((u - c.sensor.centre) @ c.sensor.matrix.T, axis=1) - 1
@@ -87,7 +87,7 @@ def test_what_differs_from_run_to_run_counts_though_an_effect_explains_it(paper_
         warm = [size * np.exp(-p.t_s / 300) for p in poses]
         scale = paper_unit.scale_factor
         runs.append([replace(p, mean=p.mean + scale * w) for p, w in zip(poses, warm, strict=True)])
-    poses = together(runs)
+    poses = gather(runs)
     (effect,) = (e for e in by_run([effect_named("warm_up")], poses) if e.name == "warm_up")
     shown = next(e for e in effect.variants(_covariates(poses)) if len(e.coefficients) == 12 and 200 < _tau(e) < 450)
     c = fit(poses, signs=MINUS, effects=[shown])

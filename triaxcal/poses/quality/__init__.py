@@ -2,6 +2,6 @@
 outputs, gaps, mains, coarse steps."""
 
 from triaxcal.poses.quality.detector import QualityDetector, disturbances
-from triaxcal.poses.quality.finding import Finding, untrusted_poses
+from triaxcal.poses.quality.finding import QualityFinding, faulty_poses
 
-__all__ = ["Finding", "QualityDetector", "disturbances", "untrusted_poses"]
+__all__ = ["QualityDetector", "QualityFinding", "disturbances", "faulty_poses"]

@@ -22,10 +22,10 @@ from triaxcal.poses.quality.finding import (
     AXES,
     Disturbance,
     DisturbedPoses,
-    Finding,
     MergedPoses,
     MissingSamples,
     Move,
+    QualityFinding,
     StillIntervals,
 )
 from triaxcal.poses.stillness.detector import Span
@@ -115,7 +115,7 @@ class QualityDetector:
         self._gaps.feed(time_ns)
         self._spectra.feed(time_ns, u)
 
-    def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[Finding]:
+    def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[QualityFinding]:
         """One for each kind of fault, with the still ``spans`` that windows
         ``w`` of the same stream show."""
         if not self.samples or self._begin_ns is None:
@@ -148,7 +148,7 @@ class QualityDetector:
         ]
         return [f for f in found if f is not None]
 
-    def _missing(self) -> Finding | None:
+    def _missing(self) -> QualityFinding | None:
         g = self._gaps
         if not g.gaps or self._begin_ns is None:
             return None
@@ -159,10 +159,10 @@ class QualityDetector:
 # What the poses themselves are to be blamed for: shaking, and moves that it hid.
 
 
-def disturbances(poses: Sequence[Pose]) -> list[Finding]:
+def disturbances(poses: Sequence[Pose]) -> list[QualityFinding]:
     """Of the poses of one recording, in order of time: those that are shaken,
     in a part or all through, and those that a move parts which shaking hid."""
-    found: list[Finding] = []
+    found: list[QualityFinding] = []
     by_pose = [_of(p) for p in poses]
     if all_of_them := tuple(itertools.chain.from_iterable(by_pose)):
         disturbed = tuple(i for i, own in enumerate(by_pose) if own)

@@ -16,8 +16,8 @@ from triaxcal.poses.quality.finding import (
     AtRail,
     CoarseQuantization,
     DuplicateSamples,
-    Finding,
     Freeze,
+    QualityFinding,
     Saturation,
     SlowUpdate,
     Steps,
@@ -352,7 +352,7 @@ harm."""
 
 def saturation(
     cells: Cells, runs: RunLengths, holds: StillIntervals, step: Floats, scatter: Floats, noisy: Bools
-) -> tuple[Finding | None, list[set[int]]]:
+) -> tuple[QualityFinding | None, list[set[int]]]:
     """And the poses that lie at a rail, by axis."""
     rails: list[AtRail] = []
     affected: list[set[int]] = [set(), set(), set()]
@@ -457,7 +457,7 @@ def _full_scale(rail: float, step: float, side: int) -> bool:
 
 def stuck_output(
     frozen: Sequence[Sequence[EqualRun]], slow: SlowUpdate | None, holds: StillIntervals, dead: Sequence[str]
-) -> Finding | None:
+) -> QualityFinding | None:
     """``dead`` are axes that never change."""
     freezes = []
     for axis, runs in enumerate(frozen):
@@ -493,7 +493,7 @@ def repeated_samples(
     return None, DuplicateSamples(triple, samples)
 
 
-def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], step: Floats) -> Finding | None:
+def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], step: Floats) -> QualityFinding | None:
     """Where steps are wider than twice the scatter in the poses, so that a mean
     keeps part of its rounding error; ``affected`` are poses, by axis, that lack
     their scatter for another reason.

@@ -1,5 +1,5 @@
-"""One kind of fault of a raw stream, and the still spans as the judges of it
-need them."""
+"""Faults of a raw stream as values, and the still spans that their detection
+needs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import Windows
 
 AXES = "xyz"
-UNTRUSTED = ("saturation", "stuck_output")
-"""Faults for which a mean is not that of the acceleration."""
+INVALIDATING = ("saturation", "stuck_output")
+"""Faults with which a mean does not follow the acceleration."""
 
 
 @dataclass(frozen=True)
 class Touched:
-    """The still spans that a fault touches, by index, and where each begins, in
+    """The still spans that a fault affects, by index, and the beginning of each in
     seconds from the first sample."""
 
     poses: tuple[int, ...] = ()
@@ -28,21 +28,21 @@ class Touched:
 
 
 @dataclass(frozen=True)
-class Finding:
-    """A kind of fault, ``name`` as in data-quality lines. `triaxcal.text` says
-    what, which axis, how much and where."""
+class QualityFinding:
+    """A kind of fault with its data-quality ``name``; `triaxcal.text` describes it in
+    a sentence."""
 
     name: ClassVar[str]
 
     @property
     def poses(self) -> tuple[int, ...]:
-        """Indices of the spans that it touches, which have to be taken again."""
+        """Indices of the affected spans, which have to be repeated."""
         return ()
 
 
 @dataclass(frozen=True)
 class AtRail:
-    """So many ``samples`` of an axis read one extreme value, output units."""
+    """Number of ``samples`` of an axis at one extreme value, output units."""
 
     axis: str
     rail: float
@@ -52,7 +52,7 @@ class AtRail:
 
 
 @dataclass(frozen=True)
-class Saturation(Finding):
+class Saturation(QualityFinding):
     name: ClassVar[str] = "saturation"
     rails: tuple[AtRail, ...]
 
@@ -63,8 +63,8 @@ class Saturation(Finding):
 
 @dataclass(frozen=True)
 class Freeze:
-    """An axis (None: all at once) repeats a reading, so many ``times``, for up
-    to ``longest`` samples; ``value`` is that of the longest, output units."""
+    """An axis (None: all at once) repeats a reading ``times`` times, for up to
+    ``longest`` samples; ``value`` is that of the longest, output units."""
 
     axis: str | None
     value: float
@@ -76,15 +76,14 @@ class Freeze:
 
 @dataclass(frozen=True)
 class SlowUpdate:
-    """There are new values only ``every`` so many samples, of a stream of
-    ``rate_hz``."""
+    """New values come only ``every`` so many samples, in a stream of ``rate_hz``."""
 
     every: float
     rate_hz: float
 
 
 @dataclass(frozen=True)
-class StuckOutput(Finding):
+class StuckOutput(QualityFinding):
     """``dead`` are axes that never change."""
 
     name: ClassVar[str] = "stuck_output"
@@ -98,8 +97,8 @@ class StuckOutput(Finding):
 
 
 @dataclass(frozen=True)
-class MissingSamples(Finding):
-    """By the times, ``missing`` of ``of`` samples, in so many ``gaps``."""
+class MissingSamples(QualityFinding):
+    """By the times, ``missing`` of ``of`` samples, in ``gaps`` gaps."""
 
     name: ClassVar[str] = "missing_samples"
     missing: int
@@ -110,8 +109,8 @@ class MissingSamples(Finding):
 
 
 @dataclass(frozen=True)
-class DuplicateSamples(Finding):
-    """So many of the samples repeat the one before on all axes."""
+class DuplicateSamples(QualityFinding):
+    """``repeated`` samples equal the previous one on all axes."""
 
     name: ClassVar[str] = "duplicate_samples"
     repeated: int
@@ -120,8 +119,8 @@ class DuplicateSamples(Finding):
 
 @dataclass(frozen=True)
 class Tone:
-    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency that
-    it may be the alias of."""
+    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency of which it
+    may be the alias."""
 
     frequency_hz: float
     amplitude: tuple[float, float, float]
@@ -129,7 +128,7 @@ class Tone:
 
 
 @dataclass(frozen=True)
-class MainsPickup(Finding):
+class MainsPickup(QualityFinding):
     name: ClassVar[str] = "mains_pickup"
     tones: tuple[Tone, ...]
     rate_hz: float
@@ -137,8 +136,8 @@ class MainsPickup(Finding):
 
 @dataclass(frozen=True)
 class Steps:
-    """Of an axis, with the scatter in the poses and by how much pose means may
-    be off, output units."""
+    """Steps of an axis, with the scatter in the poses and the possible error of pose
+    means, output units."""
 
     axis: str
     step: float
@@ -147,17 +146,17 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class CoarseQuantization(Finding):
+class CoarseQuantization(QualityFinding):
     name: ClassVar[str] = "coarse_quantization"
     axes: tuple[Steps, ...]
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Of the pose that begins at ``pose_s``: a stretch of time that its mean
-    leaves out, or the whole pose (None). The outputs scatter so many ``times``
-    as in the rest of the pose, or as in most poses; of a stretch ``scatter`` is
-    a standard deviation, output units."""
+    """A disturbance of the pose that begins at ``pose_s``: a stretch of time that its
+    mean excludes, or the whole pose (None). The outputs scatter so many ``times`` as
+    in the rest of the pose, or as in most poses; ``scatter`` of a stretch is a
+    standard deviation, output units."""
 
     pose_s: float
     stretch_s: tuple[float, float] | None
@@ -166,8 +165,8 @@ class Disturbance:
 
 
 @dataclass(frozen=True)
-class DisturbedPoses(Finding):
-    """``disturbed`` are the indices of the poses, of so many."""
+class DisturbedPoses(QualityFinding):
+    """``disturbed`` are the indices of the poses, ``of`` the number of all."""
 
     name: ClassVar[str] = "disturbed_pose"
     disturbances: tuple[Disturbance, ...]
@@ -177,7 +176,7 @@ class DisturbedPoses(Finding):
 
 @dataclass(frozen=True)
 class Move:
-    """From one pose to the next, between these times, by ``apart`` in the
+    """A move from one pose to the next, between these times, by ``apart`` in the
     output that changes most."""
 
     start_s: float
@@ -187,23 +186,22 @@ class Move:
 
 
 @dataclass(frozen=True)
-class MergedPoses(Finding):
+class MergedPoses(QualityFinding):
     name: ClassVar[str] = "merged_poses"
     moves: tuple[Move, ...]
 
 
-def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
+def faulty_poses(findings: Iterable[QualityFinding]) -> dict[int, str]:
     """By index, the still spans in which the outputs do not follow the
     acceleration, with the name of the fault."""
-    return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
+    return {i: f.name for f in findings if f.name in INVALIDATING for i in f.poses}
 
 
 @dataclass(frozen=True)
 class StillIntervals:
-    """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns``
-    is where its seconds begin. ``variance`` (k,3) of the readings in each, slow
-    noise included.
-    """
+    """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns`` is the
+    zero of its seconds. ``variance`` (k,3) of the readings in each, slow noise
+    included."""
 
     begin_ns: int
     start_ns: Ints
@@ -227,8 +225,7 @@ class StillIntervals:
         return (time_ns - self.begin_ns) * 1e-9
 
     def within(self, start_ns: Ints, end_ns: Ints) -> Ints:
-        """(n,) index of the span in which each stretch of time lies whole, else
-        -1."""
+        """(n,) index of the span that contains each stretch of time, else -1."""
         if not len(self):
             return np.full(len(start_ns), -1, dtype=np.int64)
         at = np.searchsorted(self.start_ns, start_ns, side="right") - 1
@@ -236,7 +233,7 @@ class StillIntervals:
         return np.where(whole, at, -1)
 
     def touched(self, start_ns: int, end_ns: int) -> tuple[int, ...]:
-        """Spans that share time with a stretch."""
+        """Spans that overlap a stretch of time."""
         shared: Bools = (self.start_ns <= end_ns) & (self.end_ns >= start_ns)
         return tuple(int(i) for i in np.flatnonzero(shared))
 

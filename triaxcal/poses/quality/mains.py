@@ -54,7 +54,7 @@ beside it too."""
 OUTLYING = 4.0
 """Standard deviations above the noise beside a band: bins beyond hold a line of
 their own."""
-LOUD = 4.0  # over the median level: a machine was on, or somebody knocked
+STRONG = 4.0  # over the median level: a machine was on, or somebody knocked
 KNOCK = 12.0
 """Segments this much louder than most are left out, and bins of a single one
 count no more than this: knocks."""
@@ -190,7 +190,7 @@ class Spectra:
         bin_hz = 1e9 / self.period_ns / self.size
         for axis in range(3):
             level = np.median(power[:, axis, band.flank], axis=1)
-            sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < LOUD * np.median(level))
+            sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < STRONG * np.median(level))
             if sound.sum() < SEGMENTS_LEAST:
                 continue
             # One level for all: a bin over its own segment's level is small
@@ -244,8 +244,8 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
     p_value = _raised(float(np.exp(off[peak])), shape, int(used.sum()) / (order + 1))
     # A line is narrow: three bins away it is gone, while the skirt of something
     # broad is not.
-    beside = [clipped[i] for d in (3, 4) for i in (peak - d, peak + d) if 0 <= i < len(clipped)]
-    narrow = _raised(float(clipped[peak] / np.mean(beside)), shape, len(beside))
+    neighbours = [clipped[i] for d in (3, 4) for i in (peak - d, peak + d) if 0 <= i < len(clipped)]
+    narrow = _raised(float(clipped[peak] / np.mean(neighbours)), shape, len(neighbours))
     return peak, max(p_value, narrow), np.exp(fitted)
 
 
@@ -259,9 +259,9 @@ def _raised(excess: float, shape: float, bins: float) -> float:
 def _offset(excess: Floats, peak: int) -> float:
     """Of a line from the bin at its peak, in bins: by the ratio of the
     amplitudes beside it, through a Hann window."""
-    beside = [excess[i] if 0 <= i < len(excess) else 0.0 for i in (peak - 1, peak + 1)]
-    up = beside[1] > beside[0]
-    share = float(np.sqrt(max(beside[int(up)], 0.0) / max(excess[peak], 1e-300)))
+    neighbours = [excess[i] if 0 <= i < len(excess) else 0.0 for i in (peak - 1, peak + 1)]
+    up = neighbours[1] > neighbours[0]
+    share = float(np.sqrt(max(neighbours[int(up)], 0.0) / max(excess[peak], 1e-300)))
     return float(np.clip((2 * share - 1) / (share + 1), 0.0, 0.5)) * (1 if up else -1)
 
 

@@ -1,13 +1,13 @@
-"""Where the unit stood still: a detector that learns the noise from the stream
-itself.
+"""Detection of still spans, with the noise learned from the stream itself.
 
-It works on the windows of `triaxcal.poses.stillness.windows`, in three steps.
-What scatters inside a window as the quietest windows do is calm. Among calm
-windows a move shows in the difference of neighbouring averages over one window
-and more, judged by how such differences scatter in this very stream, whatever
-the colour of its noise. What is left are runs, trimmed where a move sets out or
-settles, and put together where only a bump parts them. Where a machine shakes
-the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left."""
+The detector works on the windows of `triaxcal.poses.stillness.windows`, in three
+steps. Calm windows have the scatter of the quietest ones. Among calm windows a move
+shows in the difference of neighbouring averages over one or more windows, compared
+with the scatter of such differences in this stream, whatever the colour of its noise.
+The remaining runs are trimmed where a move begins or settles, and joined where only a
+bump separates them. Where a machine shakes the stand,
+`triaxcal.poses.stillness.vibration` finds the remaining poses.
+"""
 
 from __future__ import annotations
 
@@ -31,40 +31,39 @@ from triaxcal.poses.stillness.noise_scales import (
     trimmed,
     unbroken,
 )
-from triaxcal.poses.stillness.shaken import (
+from triaxcal.poses.stillness.vibration import (
     ALONE_S,
     MOVE_SIGMA,
     disturbances,
     parted,
     runs,
-    shaken_noise,
-    shaken_runs,
+    vibrating_runs,
+    vibration_noise,
     worth_keeping,
 )
 from triaxcal.poses.stillness.windows import RATE_LEAST, Rounding, WindowCutter, Windows, resolution, window_size
 
-# A unit that turns in place: what a turn about the vertical shows between the poses
-# about it.
+# In-place rotation: a turn about the vertical between poses of the same mean.
 
 TURN_S = 1.0
-"""Turning a fixture by half a circle and putting it down takes as long; some
-knocks that ring do. What noise makes of the longest averages, which are over
-0.8 s, is shorter, but for rare chance."""
+"""In-place rotation of a fixture by half a turn takes as long, and so do some knocks
+that ring. The longest averages extend noise over 0.8 s; longer is rare."""
 IN_PLACE = 0.01
-"""Of the range of the outputs. Where poses cover the sphere this is 20 mrad:
-two orientations on a table that tilts by 10 mrad, or the pull 8 cm off the axis
-of half a turn in 2 s, on average."""
+"""In the range of the outputs. With poses over the sphere this is 20 mrad: two
+orientations on a table tilted by 10 mrad, or the mean acceleration 8 cm off the axis
+of half a turn in 2 s."""
 PAUSE = 1 / 2
-"""What stands still on the way is shorter than this share of poses before and
-after it. A pose that is lost so costs its data; a piece of a turn that is taken
-for one puts its pull into the face."""
+"""A pause within a rotation is shorter than this share of the poses before and after
+it. A lost pose costs its data; a pause that is taken for a pose puts the acceleration
+of the turn into it."""
 
 
-def without_turns(w: Windows, quiet: list[Ints], shaken: list[Ints]) -> list[Ints]:
-    """Still pieces in order of time, but those that turns in place show between
-    quiet ones."""
+def without_rotations(w: Windows, quiet: list[Ints], vibrating: list[Ints]) -> list[Ints]:
+    """Still pieces in order of time, without those between quiet pieces that belong
+    to an in-place rotation."""
+    # Group the pieces by place; within a place, drop pieces between quiet ones.
     known = {int(piece[0]) for piece in quiet}
-    pieces = sorted([*quiet, *shaken], key=lambda p: int(p[0]))
+    pieces = sorted([*quiet, *vibrating], key=lambda p: int(p[0]))
     kept: list[Ints] = []
     for place in _places(w, pieces):
         at = [k for k, piece in enumerate(place) if int(piece[0]) in known]
@@ -74,9 +73,10 @@ def without_turns(w: Windows, quiet: list[Ints], shaken: list[Ints]) -> list[Int
 
 
 def _places(w: Windows, pieces: list[Ints]) -> Iterator[list[Ints]]:
-    """Pieces that follow one another in place."""
+    """Groups of consecutive pieces with the same mean."""
     if not pieces:
         return
+    # A new place begins where the mean changes by more than IN_PLACE of the range.
     level: Floats = np.array([w.mean[piece].mean(axis=0) for piece in pieces])
     apart = np.abs(np.diff(level, axis=0)).max(axis=1)
     moved = np.flatnonzero(apart > IN_PLACE * np.ptp(level, axis=0).max()) + 1
@@ -85,7 +85,8 @@ def _places(w: Windows, pieces: list[Ints]) -> Iterator[list[Ints]]:
 
 
 def _without_pauses(place: list[Ints]) -> list[Ints]:
-    """Without those that have far longer ones before them and after them."""
+    """The pieces of a place without those that have much longer pieces before and
+    after."""
     length = np.array([len(piece) for piece in place])
     before = np.maximum.accumulate(length)
     after = np.maximum.accumulate(length[::-1])[::-1]
@@ -96,43 +97,42 @@ def _without_pauses(place: list[Ints]) -> list[Ints]:
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
 SPAN_LEAST_S = 0.4
-"""Four windows: in less there is hardly a middle beside the
+"""Four windows: a shorter span has hardly a middle between its
 ends."""
 REJOIN_S = 1.5
-"""A disturbance shorter than this, with the same mean before and after, is a
-bump inside one pose."""
+"""A shorter disturbance with the same mean before and after is a bump inside one
+pose."""
 FALSE_ALARM = 1e-6
-"""Probability that the noise of an axis takes a still window for motion: once
-in 28 hours."""
+"""Probability that the noise of an axis makes a still window look moving: once in 28
+hours."""
 STEP_SIGMA = 7.0
-"""Of a single step, tested on noise that need not be Gaussian."""
+"""Limit for a single step, where the noise need not be Gaussian."""
 BESIDE = 6
-"""Windows beside a run in which a move shows."""
+"""Windows next to a run that show whether it is part of a move."""
 MOTION = 2.0
-"""Of a random walk, the strongest colour that noise has, a quarter of the
-squared steps is below 0.4 of the scatter."""
+"""For a random walk, the strongest colour of noise, a quarter of the squared steps is
+below 0.4 of the scatter."""
 SLIGHT = 0.01
-"""Slow vibration moves the outputs from window to window by no more than this
-share of their range."""
+"""Slow vibration changes the outputs from window to window by a smaller share of
+their range."""
 FROZEN_WINDOWS = 3
-"""An output is frozen that repeats one reading over so many windows, though
-noise is wider than its steps."""
+"""Number of windows with one reading after which an output is frozen, if its noise is
+wider than its steps."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A still span as indices of windows. ``used`` (k,) are the windows in it
-    that no bump disturbs.
+    """A still span as indices of windows. ``used`` (k,) are its undisturbed windows.
 
-    ``since_s`` is how long the disturbance before it lasted, where that left
-    the mean as it was; else infinite. ``shaken`` (j,) are the windows of its
-    disturbances, of which ``used`` has none. ``parted``: a move that shaking
-    hid lies between this span and the one before.
+    ``since_s`` is the duration of the disturbance before it, where this left the mean
+    unchanged; else infinite. ``vibrating`` (j,) are the windows of its disturbances,
+    none of them in ``used``. ``parted``: a move hidden by vibration lies between this
+    span and the previous one.
     """
 
     used: Ints
     since_s: float = math.inf
-    shaken: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    vibrating: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     parted: bool = False
 
     @property
@@ -158,8 +158,8 @@ class StillnessDetector(WindowCutter):
         return super().windows()
 
     def too_short(self) -> TooShort | None:
-        """Why no pose could be found, whatever the unit did; None where one
-        could."""
+        """The reason why no pose can be found in so short a stream; None where one
+        can."""
         try:
             w = self.windows()
         except TooShort as e:
@@ -179,8 +179,8 @@ class StillnessDetector(WindowCutter):
 
 
 def least_samples(period_ns: float) -> int:
-    """Of a stream in which a pose can be found, at a sample period that may be
-    infinite: its windows and their guards."""
+    """Samples of the shortest stream with a detectable pose (windows and guards), at
+    a sample period that may be infinite."""
     size = window_size(period_ns)
     windows = max(SPAN_LEAST_WINDOWS, math.ceil((SPAN_LEAST_S * 1e9 / period_ns + 1) / size))
     return max(RATE_LEAST, (windows + 2 * GUARD) * size)
@@ -195,22 +195,22 @@ def _too_short(samples: int, span_ns: float, period_ns: float, *, in_pieces: boo
 def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     """The still spans of a stream of windows, at least 0.4 s long.
 
-    A unit that turns about the vertical on a level table comes to rest with the
-    mean that it had: no reading tells the turn from a bump. Where the unit may
-    have turned so, ``turn_s`` says how long a turn takes at least; a
-    disturbance of that length parts spans then, whatever the means, and what
-    stands out of it for a while is no span of its own
-    (`triaxcal.poses.stillness.detector`).
+    A unit that turns about the vertical on a level table comes to rest with the same
+    mean: no reading distinguishes the rotation from a bump. Where such rotations
+    occur, ``turn_s`` is their shortest duration: a disturbance of that length
+    separates spans, whatever the means, and a pause within it is no span
+    (`without_rotations`).
     """
-    # Rounding of a digital output leaves windows without any scatter; a step of
-    # it is noise all the same.
+    # Constant windows of a digital output have the variance of half a step.
     raw, step = w.variance, resolution(w)
     frozen = _frozen(w, step)
     live, stuck = np.asarray(~frozen.any(axis=1)), np.asarray(frozen.all(axis=1))
     w = replace(w, variance=np.maximum(raw, step**2 / 4))
+    # Calm windows, by a limit from the quietest ones.
     calm = np.asarray((w.variance <= quiet_limit(w.variance[live], w.size - 1)).all(axis=1)) & ~stuck
     if _only_moves(w, calm):
         return []
+    # First still runs; then twice the limits from the windows inside them.
     found, noise, steady = _still_runs(w, calm, live, _rounding(step, raw[calm & live]))
     for _ in range(2):
         inside = _inside(w, found) & live
@@ -218,53 +218,54 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
             break
         calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1)) & ~stuck
         found, noise, steady = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
+    # Quiet pieces, then vibrating pieces in the rest of the stream.
     taken, pieces = _quiet_pieces(w, found, noise)
-    shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
+    vibrating = vibrating_runs(w, [*taken, *runs(stuck, w.joined)], noise)
     disturbed = ~steady
+    # Separate in-place rotations, or keep all pieces.
     if turn_s is None:
-        kept, longest = sorted([*pieces, *shaken], key=lambda p: int(p[0])), REJOIN_S
+        kept, longest = sorted([*pieces, *vibrating], key=lambda p: int(p[0])), REJOIN_S
     else:
-        kept, longest = without_turns(w, pieces, shaken), turn_s
+        kept, longest = without_rotations(w, pieces, vibrating), turn_s
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
+    # Join pieces of one pose, then split poses that hide a move.
     poses = _rejoined(w, kept, noise, disturbed, longest)
     return [span for pose, since_s in poses for span in _spans_of(w, pose, quiet, noise, since_s)]
 
 
 def _spans_of(w: Windows, pose: list[Ints], quiet: Bools, noise: NoiseScales, since_s: float) -> list[Span]:
-    """The spans, long enough, of what was taken for one pose: more than one
-    where shaking hid a move."""
+    """The sufficiently long spans of one pose: several where vibration hid a move."""
     spans: list[Span] = []
     for part in parted(w, pose, [bool(quiet[p[0]]) for p in pose], noise):
-        used, shaken = _without_shaken(w, part, quiet, noise)
+        used, vibrating = _without_vibration(w, part, quiet, noise)
         if _long_enough(w, used, SPAN_LEAST_S if quiet[used].any() else ALONE_S):
-            disturbed = disturbances(w, used, shaken)
+            disturbed = disturbances(w, used, vibrating)
             spans.append(Span(used, math.inf if spans else since_s, disturbed, parted=bool(spans)))
     return spans
 
 
-def _without_shaken(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScales) -> tuple[Ints, Ints]:
-    """The windows of a pose that its mean is taken over, and the shaken ones
-    that would make it worse."""
+def _without_vibration(w: Windows, part: list[Ints], quiet: Bools, noise: NoiseScales) -> tuple[Ints, Ints]:
+    """The windows that enter the mean of a pose, and the vibrating ones that would
+    make it worse."""
     still = [p for p in part if quiet[p[0]]]
     if not still or not _long_enough(w, np.concatenate(still), SPAN_LEAST_S):
         return np.concatenate(part), np.zeros(0, dtype=np.int64)
     known = np.concatenate(still)
     kept = [bool(quiet[p[0]]) or worth_keeping(w, p, known, noise) for p in part]
-    shaken = [p for p, k in zip(part, kept, strict=True) if not k]
+    vibrating = [p for p, k in zip(part, kept, strict=True) if not k]
     used = [p for p, k in zip(part, kept, strict=True) if k]
-    return np.concatenate(used), np.concatenate([np.zeros(0, dtype=np.int64), *shaken])
+    return np.concatenate(used), np.concatenate([np.zeros(0, dtype=np.int64), *vibrating])
 
 
 def _rounding(step: Floats, quiet: Floats) -> Rounding:
-    """What the step adds, by the variances (k,3) of quiet windows: of their
-    mean, since a median of windows with one reading or two says little."""
+    """Rounding by the ``step``, from the mean variance of quiet windows (k,3): their
+    median is unreliable where windows hold one or two readings."""
     return Rounding.of(step, quiet.mean(axis=0) if len(quiet) else np.zeros(3))
 
 
 def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[list[Ints], list[Ints]]:
-    """Runs that are settled, one way or the other, and the still pieces of
-    them."""
+    """Runs that are decided, and the still pieces among them."""
     taken, pieces = [], []
     for run in found:
         if _under_way(w, run, noise):
@@ -278,18 +279,19 @@ def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[li
 
 
 def _frozen(w: Windows, step: Floats) -> Bools:
-    """(m,3) windows in which an axis is frozen: they show no noise, and nothing
-    is learned from them. Nor is it a pose where all axes are: what the unit
-    does meanwhile, nobody knows.
+    """(m,3) windows in which an axis is frozen. They show no noise and teach none,
+    and a window with all axes frozen is no part of a pose: the motion of the unit is
+    unknown there.
 
-    An output whose ``step`` is as wide as its noise repeats readings too, but
-    it does so again and again, or else changes by a step or two.
+    An output with a ``step`` as wide as its noise repeats readings too, but often, or
+    with changes of a step or two.
     """
     frozen = np.zeros((len(w), 3), dtype=bool)
-    # One reading that differs by a step makes more of either.
+    # A single reading that differs by a step would exceed either limit.
     repeats = w.variance < step**2 / (2 * w.size)
     same = np.abs(np.diff(w.mean, axis=0, prepend=w.mean[:1])) < step / (2 * w.size)
     for axis in range(3):
+        # Runs of equal windows; other repeats must be rarer than live windows.
         found = runs(repeats[:, axis], w.joined & same[:, axis])
         live = w.variance[~repeats[:, axis], axis]
         again = sum(map(len, found)) - max(map(len, found), default=0)
@@ -300,8 +302,9 @@ def _frozen(w: Windows, step: Floats) -> Bools:
 
 
 def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales, Bools]:
-    """Runs of windows that are calm and do not move, the noise they were judged
-    by, learned from the ``live``, and which windows are steady by it."""
+    """Runs of calm windows without moves, the noise of their detection (learned from
+    the ``live`` ones), and the steady windows."""
+    # Iterate: noise of the steady windows, then steadiness under that noise.
     noise = NoiseScales.learned(w, calm & live, rounding, first=True)
     for _ in range(2):
         noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, rounding)
@@ -310,12 +313,14 @@ def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tup
 
 
 def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
-    """Whether a run that climbs steadily is the middle of a move: a pose that
-    creeps lies between faster moves."""
+    """Whether a steadily climbing run is the middle of a move. A creeping pose lies
+    between faster moves."""
+    # Least-squares slope, in standard deviations of a step between windows.
     x = run - run.mean()
     pace = x @ w.mean[run] / max(float(x @ x), 1.0) / noise.step[1]
     if np.abs(pace).max() < 1:
         return False
+    # Speed on either side of the run.
     for beside in (run[0] - np.arange(BESIDE), run[-1] + 1 + np.arange(BESIDE)):
         if beside.min() < 1 or beside.max() >= len(w) or not w.joined[beside].all():
             continue
@@ -326,29 +331,31 @@ def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
 
 
 def quiet_limit(variance: Floats, dof: int) -> Floats:
-    """(3,) the largest scatter that noise alone makes in a window, learned from
-    the quietest windows.
+    """(3,) largest scatter of a window by noise alone, learned from the quietest
+    windows.
 
-    Still windows crowd around one scatter while moving ones spread over decades
-    above it: the mode of the logarithm is the noise, and how far the windows
-    below it reach tells its effective degrees of freedom, which are fewer than
-    the samples where the noise is coloured.
+    The logarithms of the variances of still windows cluster, while moving ones spread
+    over decades above. The mode is the noise; the spread of the windows below it
+    gives the effective degrees of freedom, fewer than the samples for coloured noise.
     """
     limit = np.zeros(3)
+    # Distance from mode to lower median, for each number of degrees of freedom.
     tried = np.unique(np.r_[np.geomspace(1, max(dof, 2), 40), dof])
     reaches = -np.log(chi2_ppf(chi2_cdf(tried, tried) / 2, tried) / tried)
     for axis in range(3):
+        # Mode, distance below it, and the matching degrees of freedom.
         log = np.sort(np.log(np.maximum(variance[:, axis], 1e-300)))
         mode = _half_sample_mode(log)
         below = log[log < mode]
         reach = float(mode - np.median(below)) if len(below) else 0.0
         effective = tried[int(np.argmin(np.abs(reaches - reach)))]
+        # Upper chi-square quantile at the false-alarm rate.
         limit[axis] = np.exp(mode) * chi2_isf(FALSE_ALARM, effective) / effective
     return limit
 
 
 def _half_sample_mode(ordered: Floats) -> float:
-    """The densest place of sorted values: the densest half, again and again
+    """Mode of sorted values by the half-sample method: the densest half, repeatedly
     (Robertson and Cryer 1974)."""
     while len(ordered) > 8:
         half = (len(ordered) + 1) // 2
@@ -359,10 +366,9 @@ def _half_sample_mode(ordered: Floats) -> float:
 
 
 def _limit_within(variance: Floats, most: int) -> Floats:
-    """(3,) the same limit from windows of which all but a few are known to be
-    still: chi-square with the degrees of freedom, ``most`` at most, that the
-    spread between the quartiles of the logarithm shows.
-    """
+    """(3,) the same limit from windows nearly all of which are still: chi-square with
+    the degrees of freedom (``most`` at most) that match the interquartile range of
+    the logarithm."""
     log = np.log(np.maximum(variance, 1e-300))
     low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
     tried = np.geomspace(0.5, most, 80)
@@ -372,8 +378,7 @@ def _limit_within(variance: Floats, most: int) -> Floats:
 
 
 def _inside(w: Windows, pieces: list[Ints]) -> Bools:
-    """Windows from the first to the last of each span, those that were excluded
-    as well."""
+    """Windows from the first to the last of each span, with the excluded ones."""
     inside = np.zeros(len(w), dtype=bool)
     for piece in pieces:
         inside[piece] = True
@@ -384,19 +389,21 @@ def _inside(w: Windows, pieces: list[Ints]) -> Bools:
 
 
 def _only_moves(w: Windows, calm: Bools) -> bool:
-    """Whether the quietest windows are those of a motion, and nothing in the
-    stream stands still.
+    """Whether the quietest windows belong to a motion and nothing in the stream is
+    static.
 
-    Steadily moving outputs step 12 times as far from window to window, squared,
-    as they scatter inside one. Slow vibration does so too, but it is small
-    beside the differences of poses, and leads nowhere.
+    For outputs that move steadily, the squared step from window to window is 12 times
+    the variance inside one. Slow vibration shows the same, but is small compared with
+    the differences of poses and returns.
     """
+    # Squared steps over the variance inside the windows.
     at, step = contrasts(w.mean, calm, w.joined, 1, 1)
     if not len(at):
         return False
     share = step**2 / np.maximum((w.variance[at] + w.variance[at - 1]) / 2, 1e-300)
     if not (np.quantile(share, 0.25, axis=0) > MOTION).any():
         return False
+    # Motion goes on in one direction, or is large against the range.
     _, far = contrasts(w.mean, calm, w.joined, SCALES[-1], SCALES[-1])
     pace = np.median(np.abs(step), axis=0)
     leads = len(far) > 0 and (np.median(np.abs(far), axis=0) > 3 * pace).any()
@@ -404,8 +411,8 @@ def _only_moves(w: Windows, calm: Bools) -> bool:
 
 
 def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
-    """The calm windows at which no difference of neighbouring averages, short
-    or long, is more than noise."""
+    """The calm windows without significant differences of neighbouring averages at
+    any scale."""
     steady = calm.copy()
     for scale in SCALES:
         moved = _moved(w, steady, noise, scale)
@@ -417,21 +424,22 @@ def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
 
 
 def _moved(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
-    """Windows before which and from which on averages over ``scale`` windows
-    differ by more than noise."""
+    """Windows that begin a significant change between averages over ``scale``
+    windows."""
     at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
     if not len(at):
         return at
     sigma = noise.step[scale]
     if scale == 1:
         return np.asarray(at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)])
+    # Subtract the common climb of the run: steady creep is no move.
     difference -= _common_climb(at, difference / sigma) * sigma
     return np.asarray(at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)])
 
 
 def _common_climb(at: Ints, z: Floats) -> Floats:
-    """(len, 3) what the quietest quarter of the differences of each run have in
-    common: the pace of a steady creep."""
+    """(len, 3) mean of the smallest quarter of the differences in each run: the rate
+    of a steady creep."""
     begins = np.diff(at, prepend=at[0] - 2) > 1
     run, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
     length = np.diff(first, append=len(at))
@@ -446,12 +454,13 @@ def _common_climb(at: Ints, z: Floats) -> Floats:
 
 
 def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
-    """Windows of short bumps: averages that differ from those before and from
-    those after alike."""
+    """Windows of short bumps: averages that differ in the same direction from those
+    before and after."""
     if scale not in noise.edge:
         return np.zeros(0, dtype=np.int64)
     limit = MOVE_SIGMA * noise.edge[scale]
     behind, ahead = unbroken(steady, w.joined, 4 * scale, scale), unbroken(steady, w.joined, scale, 4 * scale)
+    # Places with four times as many still windows on either side.
     at = np.intersect1d(behind, ahead - scale, assume_unique=True)
     out = np.zeros(len(at), dtype=bool)
     for axis in range(3):  # one by one: a recording may last for days
@@ -464,12 +473,12 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
 def _rejoined(
     w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float
 ) -> list[tuple[list[Ints], float]]:
-    """Pieces of one pose on either side of a bump, which is shorter than
-    ``longest_s``, put together; and how long the disturbance before lasted, as
-    `Span` has it."""
+    """Pieces of one pose joined over bumps shorter than ``longest_s``, and the
+    duration of the disturbance before each pose, as in `Span`."""
     period_s = w.period_ns * 1e-9
     poses: list[tuple[list[Ints], float]] = []
     for piece in pieces:
+        # Duration of the disturbance: disturbed windows and silence between the pieces.
         here = int(poses[-1][0][-1][-1]) if poses else 0
         silent_s = (w.start_ns[piece[0]] - w.start_ns[here]) * 1e-9 - (piece[0] - here) * period_s
         between = np.flatnonzero(disturbed[here : piece[0]])
@@ -484,12 +493,12 @@ def _rejoined(
 
 
 def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> bool:
-    """Whether the means on either side of a disturbance agree."""
+    """Whether the means on either side of a disturbance agree within noise."""
     scale = max(s for s in SCALES if s <= min(len(before), len(after)))
     here, there = before[-scale:], after[:scale]
     apart = np.abs(w.mean[here].mean(axis=0) - w.mean[there].mean(axis=0))
     level = w.variance[np.concatenate([here, there])].mean(axis=0)
-    return bool((apart <= MOVE_SIGMA * shaken_noise(noise, level, w.size).step[scale]).all())
+    return bool((apart <= MOVE_SIGMA * vibration_noise(noise, level, w.size).step[scale]).all())
 
 
 def _long_enough(w: Windows, used: Ints, least_s: float) -> bool:

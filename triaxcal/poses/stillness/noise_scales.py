@@ -9,21 +9,20 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.poses.stillness.windows import Rounding, Windows
 
-# How averages over neighbouring windows differ where nothing moves, learned from
-# the stream at every scale.
+# Standard deviations of differences of neighbouring averages, learned from the
+# static parts at every scale.
 
 SCALES = (1, 2, 4, 8)
-"""Windows in an average."""
+"""Numbers of windows in an average."""
 ENOUGH = 12
-"""Differences from which a standard deviation is learned."""
+"""Number of differences from which a standard deviation is estimated."""
 
 
 @dataclass(frozen=True)
 class NoiseScales:
     """Standard deviations (3,) of differences of averages: ``step`` of two over
-    as many windows, ``edge`` of one over a number of windows and the one over
-    four times as many beside it. ``scatter`` is that inside a window.
-    """
+    equally many windows, ``edge`` of one over a number of windows and its neighbour
+    over four times as many. ``scatter`` is that inside a window."""
 
     step: dict[int, Floats]
     edge: dict[int, Floats]
@@ -31,17 +30,19 @@ class NoiseScales:
 
     @classmethod
     def learned(cls, w: Windows, still: Bools, rounding: Rounding, *, first: bool = False) -> NoiseScales:
-        """``rounding`` is what the step of the output adds. ``first``: most
-        windows may move as yet.
+        """Noise at every scale. ``rounding`` is the contribution of the output's
+        steps. ``first``: most windows may still be moving.
 
-        Where steps are wide, most differences are zero, and a median says
-        nothing of places half-way between two steps.
+        With wide steps most differences are zero, and a median does not show the
+        variance half-way between two steps.
         """
         base = w.variance[still] if still.any() else w.variance
         scatter = np.sqrt(np.median(base, axis=0))
         quantile = 0.25 if first else 0.5
         step: dict[int, Floats] = {}
         edge: dict[int, Floats] = {}
+        # Per scale: quantile of the absolute differences, at least the rounding
+        # variance.
         for s in SCALES:
             share = 2 / (w.size * s)
             found = contrasts(w.mean, still, w.joined, s, s)[1]
@@ -54,15 +55,15 @@ class NoiseScales:
         return cls(step, edge, scatter)
 
     def of_edge(self, scale: int, before: int) -> Floats:
-        """(3,) ``edge`` for an average over ``before`` windows beside that over
-        ``scale``, fewer than four times."""
+        """(3,) ``edge`` for an average over ``before`` windows, fewer than four times
+        ``scale``, next to one over ``scale``."""
         return np.asarray(self.edge[scale] * np.sqrt((1 / scale + 1 / before) / (1.25 / scale)))
 
 
 def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, half: Floats | None) -> Floats:
-    """From a quantile of the absolute differences; without enough of them, as
-    white noise falls from half the scale. At least the variance ``least``
-    (3,)."""
+    """(3,) standard deviation from a quantile of the absolute differences; with too
+    few of them, from half the scale as for white noise. At least the variance
+    ``least`` (3,)."""
     if len(differences) >= ENOUGH:
         # A normal variable is within 0.3186 and 0.6745 standard deviations in a
         # quarter and in half of all cases.
@@ -84,8 +85,8 @@ def contrasts(values: Floats, still: Bools, joined: Bools, before: int, after: i
 
 
 def unbroken(still: Bools, joined: Bools, before: int, after: int) -> Ints:
-    """(k,) where ``before`` windows and the ``after`` windows behind them are
-    unbroken and still: the index of the first of the latter."""
+    """(k,) indices at which ``before`` windows before and ``after`` windows from
+    there on are still and without a gap."""
     n = len(still)
     broken = np.ones(n + 1, dtype=bool)
     broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
@@ -98,11 +99,12 @@ def unbroken(still: Bools, joined: Bools, before: int, after: int) -> Ints:
 
 
 def contrast(values: Floats, at: Ints, before: int, after: int) -> Floats:
-    """(k,c) how much the average of ``values`` (n,c) over ``after`` windows
-    from ``at`` (k,) on exceeds that of the ``before`` windows before it."""
+    """(k,c) mean of ``values`` (n,c) over ``after`` windows from ``at`` (k,) on, less
+    that of the ``before`` windows before."""
     offset = values[0] * ((after > 0) - int(before > 0))
     out = np.empty((len(at), values.shape[1]))
     for axis in range(values.shape[1]):  # one by one: a recording may last for days
+        # Differences of cumulative sums.
         sums = np.concatenate([[0.0], np.cumsum(values[:, axis] - values[0, axis])])
         here = (sums[at] - sums[at - before]) / max(before, 1)
         there = (sums[at + after] - sums[at]) / max(after, 1)
@@ -130,10 +132,12 @@ and within this reach."""
 
 
 def trimmed(w: Windows, run: Ints, noise: NoiseScales) -> Ints:
-    """Without one guard window at either end, nor those where a move sets out
-    or settles."""
+    """The run without a guard window at either end, and without windows in which a
+    move begins or settles."""
+    # Cut the guards, or the onset of a move, at both ends.
     late, early = _onset(w, run, noise), _onset(w, run[::-1], noise)
     run = run[max(early, GUARD) : len(run) - max(late, GUARD)]
+    # Then cut as long as an end differs from the middle, keeping at least half.
     for direction in (1, -1):
         least = max(len(run) // 2, 2 * SPAN_LEAST_WINDOWS)
         while len(run) > least:
@@ -147,13 +151,14 @@ def trimmed(w: Windows, run: Ints, noise: NoiseScales) -> Ints:
 
 
 def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
-    """How many windows at the end of a run belong to the move behind it, though
+    """Number of windows at the end of a run that belong to the move after it, though
     noise hides it there.
 
-    A move sets out smoothly, its displacement growing as the cube of time or
-    slower (a minimum-jerk path: as the cube): from two moments at which it is
-    well above the noise follows when it began.
+    A move begins smoothly: its displacement grows as the cube of time or slower (a
+    minimum-jerk path: as the cube). Two moments at which it is well above the noise
+    determine when it began.
     """
+    # Windows after the run, up to the next gap.
     n, way = len(run), int(run[-1] - run[-2]) if len(run) > 1 else 1
     behind = run[-1] + way * np.arange(1, ONSET_WINDOWS)
     behind = behind[(behind >= 0) & (behind < len(w))]
@@ -161,10 +166,12 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
     behind = behind[: broken[0]] if len(broken) else behind
     if n < 2 * SPAN_LEAST_WINDOWS or not len(behind):
         return 0
+    # Displacement from the middle of the run, in standard deviations of a step.
     away = (w.mean[behind] - w.mean[run[n // 4 : n - n // 4]].mean(axis=0)) / noise.step[1]
     z = np.maximum.accumulate(np.abs(away).max(axis=1))
     if z[-1] < ONSET_SIGMA:
         return 0
+    # The first window well above the noise, and one at four times that displacement.
     first = int(np.argmax(z >= ONSET_SIGMA))
     # A move that is there at once has no onset; what noise adds to its end is
     # none of it.
@@ -175,13 +182,15 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
     # power of the time since the onset.
     area = np.abs(np.cumsum(away, axis=0))[:, int(np.argmax(np.abs(away[second])))]
     ratio = min(float(area[first] / area[second]), 1.0) ** 0.25
+    # Extrapolate the fourth root of the area to zero.
     began = first + 1 - (second - first) * ratio / max(1 - ratio, 1e-3)
     return int(min(max(np.ceil(-1.25 * began), 0), n // 4, SCALES[-1]))
 
 
 def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
-    """How many windows at the end of a run differ from those before, in mean or
+    """Number of windows at the end of a run that differ from those before, in mean or
     in scatter."""
+    # Slope of the middle, and the log variance relative to it.
     n = len(run)
     inner = run[n // 4 : n - n // 4]
     climb = np.zeros(3)
@@ -193,8 +202,9 @@ def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
     share = np.log((w.variance[run] / np.median(w.variance[inner], axis=0)).mean(axis=1))
     middle = share[n // 4 : n - n // 4]
     spread = max(1.4826 * float(np.median(np.abs(middle - np.median(middle)))), EVENLY)
-    # A part during which a machine was off makes the rest no louder.
+    # A part without the usual vibration does not make the rest exceptional.
     usual = np.maximum(share[: n // 2], np.median(middle) - 5 * spread).mean()
+    # Compare the last windows with four times as many before, at every scale.
     for scale in SCALES:
         before = min(4 * scale, n - scale)
         if before < 2 * scale or n < 5 * scale:
@@ -206,7 +216,7 @@ def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
         change -= np.clip(change, np.minimum(crept, 0), np.maximum(crept, 0))
         if (np.abs(change) > EDGE_SIGMA * noise.of_edge(scale, before)).any():
             return scale
-        louder = float(share[-scale:].mean() - usual)
-        if n >= 12 and louder > EDGE_SIGMA * spread * np.sqrt(1 / scale + 2 / n):
+        excess = float(share[-scale:].mean() - usual)
+        if n >= 12 and excess > EDGE_SIGMA * spread * np.sqrt(1 / scale + 2 / n):
             return scale
     return 0

@@ -1,9 +1,10 @@
-"""A stream cut into windows of a tenth of a second, of which mean, scatter and
-times are all that is kept.
+"""A stream as windows of a tenth of a second, of which mean, scatter and times are
+kept.
 
-Memory grows by about a hundred bytes a window, whatever the sample rate. The
-windows depend on the samples alone, not on how they were fed, so live and
-replayed streams give the same ones."""
+Memory grows by about a hundred bytes a window at any sample rate. The windows depend
+on the samples alone, not on the size of the blocks, so live and replayed streams give
+the same ones.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +23,20 @@ WINDOW_S = 0.1
 """Short beside a pose and a move, so that edges cost little; long beside a
 sample, so that summaries are few."""
 WINDOW_LEAST = 3
-"""Samples in a window at low rates: fewer tell no scatter."""
+"""Samples in a window at low rates: fewer do not determine a scatter."""
 GAP = 4.0
-"""A silence longer than this many sample periods ends a window, and a span."""
+"""Sample periods of silence after which a window, and a span, ends."""
 RATE_SAMPLES = 64  # steps are taken over a quarter of them, so that bursts average out
 RATE_S = 1.0
-"""The sample period is learned from at least so many samples over at least so
-long."""
+"""Samples, and duration, from which the sample period is estimated."""
 RATE_LEAST = 12
-"""Samples of a stream that ends before that; with fewer the period is not
-known, and there is no window."""
+"""Least samples of a shorter stream; with fewer the period is unknown and there is no
+window."""
 
 
 def first_period_ns(time_ns: Ints) -> float:
-    """The sample period of the first samples of a stream, over a quarter of
-    them at a time, so that neither bursts nor a gap mislead."""
+    """Sample period at the beginning of a stream, from lags of a quarter of the
+    samples, robust against bursts and gaps."""
     enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
     time_ns = time_ns[:enough]
     lag = len(time_ns) // 4
@@ -52,10 +52,10 @@ def window_size(period_ns: float) -> int:
 class Windows:
     """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
 
-    ``start_ns`` and ``end_ns`` are the times of a window's first and last
-    sample; ``variance`` of a sample by axis, ``cross`` covariance of axes xy,
-    yz, zx; ``hop`` is the difference of its readings where there are two only,
-    else zero; ``joined`` says that no gap lies between it and the one before.
+    ``start_ns`` and ``end_ns`` are the times of a window's first and last sample;
+    ``variance`` of a sample by axis, ``cross`` covariance of axes xy, yz, zx; ``hop``
+    is the difference of the readings in a window that has only two, else zero;
+    ``joined``: no gap before the window.
     """
 
     size: int
@@ -73,15 +73,14 @@ class Windows:
 
     @property
     def period_ns(self) -> float:
-        """From the start of a window to the start of the next, where no gap
-        lies between."""
+        """Time from the start of a window to that of the next without a gap."""
         return float(np.median((self.end_ns - self.start_ns) * self.size / (self.size - 1)))
 
 
 @dataclass
 class WindowCutter:
-    """Cuts blocks of any size into windows. ``samples`` have come in
-    ``span_ns``, from the first to the last."""
+    """Cuts blocks of any size into windows. ``samples`` were fed over ``span_ns``,
+    from the first to the last."""
 
     samples: int = field(default=0, init=False)
     span_ns: int = field(default=0, init=False)
@@ -99,11 +98,10 @@ class WindowCutter:
     _broken: bool = False
 
     def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
-        """``time_ns`` (n,) strictly increasing across calls, ``readings``
-        (n,3), ``channels`` each (n,).
+        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3) in
+        output units, ``channels`` each (n,).
 
-        Raises InvalidData for a reading that is not a finite number: it would
-        hide every pose.
+        Raises InvalidData for a reading that is not a finite number.
         """
         if not len(time_ns):
             return
@@ -124,8 +122,8 @@ class WindowCutter:
             self._close_windows()
 
     def finish(self) -> None:
-        """No more samples come: what is pending is cut into windows as far as
-        it goes."""
+        """End of the stream: the remaining samples are cut into windows as far as
+        possible."""
         if not self._size and self._held >= RATE_LEAST:
             self._learn_rate()
             self._close_windows()
@@ -137,11 +135,13 @@ class WindowCutter:
         self._size = window_size(self._period_ns)
 
     def _close_windows(self) -> None:
+        # Samples since the last window, and the gaps among them.
         time_ns = np.concatenate([p[0] for p in self._pending])
         readings = np.concatenate([p[1] for p in self._pending])
         channels = {n: np.concatenate([p[2][n] for p in self._pending]) for n in self._pending[0][2]}
         before = self._last_ns if self._last_ns is not None else int(time_ns[0]) - int(self._period_ns)
         gaps = np.flatnonzero(np.diff(time_ns, prepend=before) > GAP * self._period_ns)
+        # Cut each stretch without a gap into whole windows; the rest stays pending.
         start, torn = 0, set(gaps.tolist())
         for stop in (*gaps[gaps > 0], len(time_ns)):
             self._longest = max(self._longest, stop - start)
@@ -188,86 +188,79 @@ class WindowCutter:
 
 
 def _hop(columns: Floats) -> Floats:
-    """(m,3) how far the two readings of a window lie apart, of ``columns``
-    (m,3,size); zero where there are others."""
+    """(m,3) difference of the two readings of a window, from ``columns`` (m,3,size);
+    zero where there are others."""
     high, low = columns.max(axis=2), columns.min(axis=2)
     two = ((columns == high[:, :, None]) | (columns == low[:, :, None])).all(axis=2)
     return np.asarray(np.where(two, high - low, 0.0))
 
 
-# What rounding to the steps of a digital output does to means and scatters of
-# readings.
+# Rounding to the steps of a digital output: its effect on means and variances.
 
 COARSEST = 50
-"""Steps that the range of the outputs has at least."""
+"""Least number of steps in the range of the outputs."""
 TWO_READINGS_LEAST = 8
-"""Windows with two readings from which a step is learned."""
+"""Number of windows with two readings from which a step is estimated."""
 ALIKE = 0.25
-"""Share of a step by which printed decimals move it, at most."""
+"""Largest effect of printed decimals, as a share of a step."""
 MOSTLY, SINGLE = 0.9, 0.6
-"""So many of these windows differ by a step, or by two or three where the unit
-moves; so many by one."""
+"""Share of these windows that differ by one, two or three steps, and share by one."""
 MOSTLY_COARSE = 0.5
-"""Of the windows: there the noise hardly shows for the steps."""
+"""Share of such windows with which the noise is narrower than the steps."""
 OTHERWISE = 1.5
-"""A step so many times the smallest difference is no matter of which readings
-happened to be seen."""
+"""Ratio of a step to the smallest difference that chance does not explain."""
 FINE = 1.0
-"""Noise of so many steps has nothing to do with them any more: exp(−2π²) is
-3e-9."""
+"""Noise in steps above which rounding has no effect: exp(−2π²) is 3e-9."""
 HARMONICS = np.arange(1, 50)[:, None]
-"""Of the series in the place between two steps. Without noise its terms go with
-1/k² and what is left out is 1.2 %; with noise they vanish as an exponential."""
+"""Terms of the Fourier series over the place between two steps. Without noise they
+decrease as 1/k² and the truncation is 1.2 %; with noise they vanish exponentially."""
 SIGMAS = np.linspace(0.0, FINE, 201)
-"""Noise in steps, where its inverse is looked up."""
+"""Grid of the noise in steps, for the inverse function."""
 BLUR = 0.01
-"""Steps squared: from one place to the next of those that are tried, variances
-differ by no more on average."""
+"""In steps squared: variances at neighbouring places of the grid differ by no more on
+average."""
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """What rounding makes of an output by axis (3,), in output units squared:
-    ``residue``, the variance that it leaves in a mean, however long, over all
-    places between two steps; ``widest``, the variance of a reading half-way
-    between two steps, where it is largest, zero where noise is wider than a
-    step.
-    """
+    """Effect of rounding on an output by axis (3,), in output units squared:
+    ``residue``, the variance of an infinitely long mean over all places between two
+    steps; ``widest``, the variance of a reading half-way between two steps, where it
+    is largest; zero where the noise is wider than a step."""
 
     residue: Floats
     widest: Floats
 
     @classmethod
     def of(cls, step: Floats, scatter: Floats) -> Rounding:
-        """``scatter`` (3,) is the variance of a reading where nothing moves, on
-        average over the places."""
+        """``scatter`` (3,) is the variance of a reading without motion, averaged over
+        the places."""
         sigma = noise_of(scatter / step**2)
         widest = np.where(sigma < FINE, widest_variance(sigma), 0.0)
         return cls(rounding_variance(step, scatter), np.asarray(step**2 * widest))
 
 
 def resolution(w: Windows) -> Floats:
-    """(3,) the smallest difference that any two readings show; never quite
-    zero.
+    """(3,) smallest difference of any two readings; never exactly zero.
 
-    A step that is a good part of the range is no resolution: outputs without
-    any noise differ by their poses alone. Where readings were printed with
-    decimals that are no multiples of the step, sums differ by those; windows
-    that hold two readings only still show the step.
+    A step that is a large part of the range is no resolution: outputs without noise
+    differ by their poses alone. Where readings are printed with decimals that are no
+    multiples of the step, sums show the decimals; windows with two readings still
+    show the step.
     """
     return _steps(w)[0]
 
 
 def _steps(w: Windows) -> tuple[Floats, Floats]:
-    """(3,) the step of the output, and (3,) that of the decimals it was printed
-    with, zero where these are the same."""
+    """(3,) step of the output, and (3,) step of the printed decimals, zero where both
+    are the same."""
     least, shown = _least_difference(w), shown_step(w)
     hidden = shown > OTHERWISE * least
     return np.where(hidden, shown, least), np.where(hidden, least, 0.0)
 
 
 def _least_difference(w: Windows) -> Floats:
-    """(3,) judged by the sums of windows."""
+    """(3,) smallest difference of the sums of windows."""
     sums = w.mean * w.size
     least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
     out = least.copy()
@@ -280,15 +273,15 @@ def _least_difference(w: Windows) -> Floats:
 
 
 def shown_step(w: Windows) -> Floats:
-    """(3,) the step between the readings of those windows that hold two
-    readings only, zero where these do not agree on one: such windows are many
-    where the noise is narrower than the step, and by chance there is none.
-    """
+    """(3,) step between the readings of windows with only two, zero where these do
+    not agree on one. Such windows are frequent where the noise is narrower than the
+    step, and never occur by chance."""
     out = np.zeros(3)
     for i in range(3):
         hops = w.hop[w.hop[:, i] > 0, i]
         if len(hops) < TWO_READINGS_LEAST:
             continue
+        # Most differences are one step; nearly all are one to three.
         step = float(np.median(hops))
         times = np.clip(np.rint(hops / step), 1, 3)
         alike = np.abs(hops / step - times) <= ALIKE
@@ -299,9 +292,9 @@ def shown_step(w: Windows) -> Floats:
 
 
 def widest_steps(w: Windows) -> Floats:
-    """(3,) the differences of readings in windows that hold two readings only,
-    where most windows hold no more: steps of the output, or the dead band of a
-    logger, which is several of them. Elsewhere the resolution."""
+    """(3,) differences of readings in windows with two readings, where most windows
+    have no more: steps of the output, or the dead band of a logger. Elsewhere the
+    resolution."""
     out = resolution(w)
     for i in range(3):
         hops = w.hop[w.hop[:, i] > 0, i]
@@ -311,19 +304,17 @@ def widest_steps(w: Windows) -> Floats:
 
 
 def rounding_variance(step: Floats, scatter: Floats) -> Floats:
-    """(3,) variance of what rounding of the outputs to ``step`` leaves in a
-    mean, however long; ``scatter`` is the variance of a reading. Noise averages
-    it out, if there is enough of it.
-    """
+    """(3,) variance of the rounding error to ``step`` in an infinitely long mean;
+    ``scatter`` is the variance of a reading. Sufficient noise averages the error
+    out."""
     return np.asarray(step**2 * mean_rounding_variance(noise_of(scatter / step**2)))
 
 
 def left_in_means(w: Windows, scatter: Floats, count: Ints) -> Floats:
-    """(3,) variance of what rounding to the steps that these windows show
-    leaves in means of poses, of which readings have ``scatter`` (k,3) over
-    ``count`` (k,) windows; and with it what printing leaves: the same reading
-    is printed with the same error, so that is averaged over readings alone.
-    """
+    """(3,) variance of the rounding error in means of poses whose readings have the
+    variance ``scatter`` (k,3) over ``count`` (k,) windows, together with that of
+    printing: equal readings have equal printing errors, so that averages over the
+    different readings alone."""
     step, printed = _steps(w)
     level = scatter.mean(axis=0) / step**2
     sigma = noise_of(level)
@@ -337,12 +328,12 @@ def left_in_means(w: Windows, scatter: Floats, count: Ints) -> Floats:
 
 
 def _left_by_poses(variance: Floats, count: Ints) -> float:
-    """`mean_rounding_variance` over all noise that poses of such ``variance``
-    (k,), in steps squared, may have, estimated from ``count`` (k,) windows:
-    where the poses lie between two steps is chance, so that the mean of few of
-    their variances says little, and what is left goes with the square of the
-    noise in an exponent.
-    """
+    """`mean_rounding_variance`, averaged over the noise that is consistent with the
+    ``variance`` (k,) of the poses, in steps squared, from ``count`` (k,) windows. The
+    place of a pose between two steps is random, so the mean of few variances is
+    unreliable, and the residue depends exponentially on the squared noise."""
+    # Likelihood of each noise level: Gaussian about the variance at every place,
+    # averaged over the places.
     sigma, seen, spread = _by_place()
     off = variance[:, None, None] - seen
     width = BLUR**2 + spread / count[:, None, None]
@@ -354,12 +345,11 @@ def _left_by_poses(variance: Floats, count: Ints) -> float:
 
 @cache
 def _by_place() -> tuple[Floats, Floats, Floats]:
-    """Noise (s,) in steps; by it and by the place between two steps, (s,p)
-    each, the variance of a reading, and that of the squared deviations, by the
-    exact sums.
-    """
+    """Noise (s,) in steps; variance of a reading (s,p) at that noise and place
+    between two steps, and the variance of its squared deviation, by exact sums."""
     sigma, place = SIGMAS[4::2], (np.arange(50) + 0.5) / 100
     codes = np.arange(-6, 8)
+    # Probability of every output code under Gaussian noise.
     edges = (np.append(codes, codes[-1] + 1) - 0.5 - place[:, None]) / sigma[:, None, None]
     share = np.diff(ndtr(edges), axis=2)
     off = codes - (share @ codes)[:, :, None]
@@ -368,26 +358,25 @@ def _by_place() -> tuple[Floats, Floats, Floats]:
 
 
 def mean_rounding_variance(sigma: Floats) -> Floats:
-    """(n,) mean square error of an endless mean over all places between two
-    steps, in steps squared, for noise of ``sigma`` (n,) steps.
-    """
+    """(n,) mean square error of an infinite mean over all places between two steps,
+    in steps squared, for noise of ``sigma`` (n,) steps: Σ exp(−4π²k²σ²) / (2π²k²)."""
     k = HARMONICS
     return np.asarray((np.exp(-4 * np.pi**2 * k**2 * sigma**2) / (2 * np.pi**2 * k**2)).sum(axis=0))
 
 
 def widest_variance(sigma: Floats) -> Floats:
-    """(n,) variance of a reading half-way between two steps, in steps squared:
-    a quarter without noise."""
+    """(n,) variance of a reading half-way between two steps, in steps squared; a
+    quarter without noise."""
     k = HARMONICS
     swing = np.exp(-2 * np.pi**2 * k**2 * sigma**2) * (1 / (np.pi**2 * k**2) + 4 * sigma**2)
     return np.asarray(sigma**2 + 1 / 12 + swing.sum(axis=0))
 
 
 def noise_of(variance: Floats) -> Floats:
-    """(n,) the noise in steps of which rounded readings have this ``variance``
-    (n,), in steps squared, on average over the places: what the mean keeps of
-    the rounding error the scatter lacks.
-    """
+    """(n,) noise in steps for rounded readings of this ``variance`` (n,), in steps
+    squared, averaged over the places. The part of the rounding error that stays in
+    the mean is missing in the variance."""
+    # Variance of a rounded reading: σ² + 1/12 less the residue of the mean; invert it.
     seen = SIGMAS**2 + 1 / 12 - mean_rounding_variance(SIGMAS)
     beyond = np.sqrt(np.maximum(variance - 1 / 12, 0.0))
     return np.asarray(np.where(variance < seen[-1], np.interp(variance, seen, SIGMAS), beyond))

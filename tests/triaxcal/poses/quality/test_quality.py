@@ -11,7 +11,7 @@ from scipy import stats
 
 from benchmarks.noise import first_order, flicker, white
 from triaxcal.arrays import Floats, Ints
-from triaxcal.poses.quality import Finding, QualityDetector, mains
+from triaxcal.poses.quality import QualityDetector, QualityFinding, mains
 from triaxcal.poses.quality.faults import Gaps, coarse_quantization
 from triaxcal.poses.quality.finding import (
     AtRail,
@@ -51,7 +51,7 @@ def stream(
     return np.round(t * 1e9).astype(np.int64), np.round(u / step) * step if step else u
 
 
-def judged(time_ns: Ints, u: Floats, block: int = 10**9) -> list[Finding]:
+def judged(time_ns: Ints, u: Floats, block: int = 10**9) -> list[QualityFinding]:
     still, quality = StillnessDetector(), QualityDetector()
     still.feed(time_ns, u)
     still.finish()
@@ -61,7 +61,7 @@ def judged(time_ns: Ints, u: Floats, block: int = 10**9) -> list[Finding]:
     return quality.findings(still.windows(), still.spans())
 
 
-def names(found: list[Finding]) -> list[str]:
+def names(found: list[QualityFinding]) -> list[str]:
     return [f.name for f in found]
 
 

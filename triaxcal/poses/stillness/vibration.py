@@ -1,14 +1,14 @@
-"""Poses during which a machine shakes the stand: the outputs scatter as much as
-in a move, but their mean stays put.
+"""Poses under vibration: the outputs scatter as in a move, but their mean is
+constant.
 
-A move carries the means of the windows away; shaking leaves them where they
-are, but for what of it a window does not average out. That is bounded. Shaking
-without a rhythm adds a random part, the variance of a sample over the samples.
-A tone of frequency f adds to an average over T at most its amplitude over πfT,
-also where the windows fall in step with it and the means wander slowly; from 5
-Hz on two neighbouring averages over s windows of 0.1 s so differ by at most 2.3
-times the scatter inside a window, over s. Neither grows with s as the way of a
-move does."""
+A move changes the means of the windows. Vibration leaves them unchanged except for
+the part that a window does not average out, and this is bounded. Random vibration
+adds the variance of a sample over the number of samples. A tone of frequency f and
+amplitude A changes an average over T by at most A/(πfT), also where it beats with the
+windows and the means wander slowly; from 5 Hz on, two neighbouring averages over s
+windows of 0.1 s differ by at most 2.3 times the scatter inside a window, over s.
+Neither bound grows with s as the path of a move does.
+"""
 
 from __future__ import annotations
 
@@ -24,33 +24,31 @@ from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrast,
 from triaxcal.poses.stillness.windows import Windows
 
 LEAST_S = 1.0
-"""A shorter rest between shaking is not told from a hand that hesitates."""
+"""A shorter rest between vibrations is not distinguished from a pause of the hand."""
 ALONE_S = 1.5
-"""A span that is shaken throughout lasts longer than a hand hesitates; a part
-of one need not."""
+"""Least duration of a span with vibration throughout, longer than a pause of the
+hand; a part of a pose may be shorter."""
 MOVE_SIGMA = 5.0
-"""Of a difference of averages: noise passes it once in two million. Less would
-cut poses in pieces; more lets slight moves pass."""
+"""Standard deviations of a difference of averages: noise exceeds this once in two
+million. A lower limit would split poses; a higher one would miss small moves."""
 TONE = 0.5
-"""The bound for tones over `MOVE_SIGMA`, about: a standard deviation to judge
-by."""
+"""Bound for tones over `MOVE_SIGMA`, approximately: an equivalent standard
+deviation."""
 LONGEST = 16
-"""Windows in the longest averages compared: jitter of a hand hides a slow turn
-from shorter ones."""
+"""Windows in the longest averages: hand tremor hides a slow rotation from shorter
+ones."""
 ABOUT = 7
-"""Windows over which the usual scatter is taken."""
+"""Windows in the running median of the scatter."""
 UNEVEN = 5.0
-"""A window belongs to a move or a knock if the median variance around it
-exceeds that of the run by this factor, or its own variance by the square."""
+"""Factor by which the median variance around a window exceeds that of the run, or by
+whose square its own variance does, if it belongs to a move or a knock."""
 SHARE = 0.03
-"""Shaking makes the outputs scatter by no more than this share of the range of
-the poses."""
+"""Largest scatter under vibration as a share of the range of the poses."""
 
 
-def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
-    """Of averages over windows of ``size`` samples that scatter with
-    ``variance`` (3,), where that is more than the quiet noise makes.
-    """
+def vibration_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
+    """Noise of averages over windows of ``size`` samples with the ``variance`` (3,),
+    where this exceeds the quiet noise."""
     excess = np.maximum(variance - noise.scatter**2, 0.0)
     return replace(
         noise,
@@ -60,20 +58,21 @@ def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales
 
 
 def _share(scale: int, size: int) -> float:
-    """Of the variance inside windows that remains in the difference of averages
-    over ``scale`` of them."""
+    """Share of the variance inside windows that remains in the difference of averages
+    over ``scale`` of them: 2/(n s) of random vibration, and the bound for tones."""
     return 2 / (size * scale) + (TONE / scale) ** 2
 
 
-def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
-    """Runs, trimmed, among the windows outside the quiet runs ``taken``, in
-    which the mean stands still.
+def vibrating_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
+    """Trimmed runs with a constant mean, among the windows outside the quiet runs
+    ``taken``.
 
-    Only what is small beside the differences of poses can be distinguished from
-    a hand that shakes the unit.
+    Only vibration that is small compared with the differences of poses can be
+    distinguished from a hand that shakes the unit.
     """
     if len(taken) < 2:
         return []
+    # Windows outside the quiet runs, with a scatter below the limit.
     levels = np.array([w.mean[run].mean(axis=0) for run in taken])
     most = (SHARE * float(np.linalg.norm(np.ptp(levels, axis=0)))) ** 2
     rest = np.asarray((w.variance <= most).all(axis=1))
@@ -81,33 +80,35 @@ def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]
         rest[max(quiet[0] - 1, 0) : quiet[-1] + 2] = False
     level = _level(w)
     found = []
-    # What scatters otherwise is something else: the end of a move, which is
-    # slow, is no part of what comes after it.
+    # A sudden change of the scatter separates runs: the slow end of a move does not
+    # belong to the pose after it.
     total = np.maximum(level.sum(axis=1), 1e-300)
     alike = w.joined & (np.abs(np.diff(np.log(total), prepend=np.log(total[0]))) < np.log(UNEVEN))
+    # Runs with a constant mean; in them, parts with even scatter, trimmed.
     for run in runs(_staying(w, rest, alike, level, noise), alike):
         usual = np.median(w.variance[run], axis=0)
         even = np.asarray(((level[run] < UNEVEN * usual) & (w.variance[run] < UNEVEN**2 * usual)).all(axis=1))
         for part in runs(even, np.ones(len(run), dtype=bool)):
             part = run[part]
-            piece = trimmed(w, part, shaken_noise(noise, w.variance[part].mean(axis=0), w.size))
+            piece = trimmed(w, part, vibration_noise(noise, w.variance[part].mean(axis=0), w.size))
             if len(piece) and (w.end_ns[piece[-1]] - w.start_ns[piece[0]]) * 1e-9 >= LEAST_S:
                 found.append(piece)
     return found
 
 
 def _level(w: Windows) -> Floats:
-    """(m,3) the usual variance about each window: a window that is shorter than
-    a swing shows now more, now less."""
+    """(m,3) running median of the variance: a window shorter than a period shows more
+    or less of it."""
     return np.asarray(scipy.ndimage.median_filter(w.variance, size=(ABOUT, 1), mode="nearest"))
 
 
 def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseScales) -> Bools:
-    """Those of the windows at which no difference of neighbouring averages is
-    more than shaking explains."""
+    """Windows without a difference of neighbouring averages that vibration does not
+    explain."""
     staying = rest.copy()
     excess = np.maximum(level - noise.scatter**2, 0.0)
     for scale in (*SCALES, LONGEST):
+        # Compare squared differences with quiet noise and the remaining vibration.
         at, difference = contrasts(w.mean, staying, alike, scale, scale)
         after = contrast(excess, at, 0, scale)
         before = contrast(excess, at, scale, 0)
@@ -121,7 +122,7 @@ def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseS
 
 
 def runs(still: Bools, joined: Bools) -> list[Ints]:
-    """Indices of unbroken runs of still windows."""
+    """Indices of uninterrupted runs of still windows."""
     index = np.flatnonzero(still)
     if not len(index):
         return []
@@ -129,26 +130,24 @@ def runs(still: Bools, joined: Bools) -> list[Ints]:
     return [np.asarray(run, dtype=np.int64) for run in np.split(index, breaks)]
 
 
-# What shaking does to a pose that is quiet besides: parts that its mean is better
-# without, and moves that the shaking hid.
+# Vibration in otherwise quiet poses: parts that are better excluded from the mean,
+# and moves hidden by the vibration.
 
 MUCH = 9.0
-"""Times the variance of the quiet part: less is not worth a word."""
-LOUD = 3.0
-"""Times the usual scatter, from which on a window counts as shaken."""
+"""In variances of the quiet part: a smaller excess is not reported."""
+VIBRATING = 3.0
+"""In usual scatters: a window with more counts as vibrating."""
 LASTING_S = 0.45
-"""A disturbance of so many shaken windows is no knock: these are over in less.
-Half a second, but for the rounding of windows."""
+"""Duration of vibrating windows that distinguishes a disturbance from a knock: half a
+second, less the rounding to windows."""
 BLOCKS = 4
-"""Averages that a part holds at least of those that tell how its means
-scatter."""
+"""Least number of averages in a part, for the scatter of its means."""
 
 
 def parted(w: Windows, pieces: Sequence[Ints], quiet: Sequence[bool], noise: NoiseScales) -> list[list[Ints]]:
-    """The pieces of what was taken for one pose, in order of time, as one list
-    or, where moves lie between its ``quiet`` pieces, as several. Shaken pieces
-    between those are in none of them: they hold the move.
-    """
+    """The pieces of one pose in order of time, as one list, or as several where moves
+    lie between its ``quiet`` pieces. Vibrating pieces between those are in none: they
+    contain the move."""
     known = [i for i, still in enumerate(quiet) if still]
     begins = [0]
     ends: list[int] = []
@@ -161,52 +160,53 @@ def parted(w: Windows, pieces: Sequence[Ints], quiet: Sequence[bool], noise: Noi
 
 
 def _moved_between(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> bool:
-    """Whether the means of two quiet pieces differ by more than their noise,
-    that being a random walk at worst, and a creep that both show."""
+    """Whether the means of two quiet pieces differ by more than noise (at worst a
+    random walk) and the creep that both show."""
     scale = max(s for s in SCALES if s <= min(len(before), len(after)))
     here, there = before[-scale:], after[:scale]
+    # Change of the mean, less the change by the common slope.
     change = w.mean[there].mean(axis=0) - w.mean[here].mean(axis=0)
     crept = _climb(w, before, after) * (there.mean() - here.mean())
     change = change - np.clip(change, np.minimum(crept, 0), np.maximum(crept, 0))
-    # Averages over s windows of a random walk, g windows apart, differ by a
-    # variance of g + 2s/3 steps; side by side by 2s/3.
+    # For a random walk, averages over s windows with a gap of g differ by the
+    # variance of g + 2s/3 steps; without a gap, of 2s/3.
     apart = 1 + 1.5 * (there[0] - here[-1] - 1) / scale
     return bool((np.abs(change) > MOVE_SIGMA * np.sqrt(apart) * noise.step[scale]).any())
 
 
 def _climb(w: Windows, *pieces: Ints) -> Floats:
-    """(3,) slope a window that pieces of one pose have in common."""
+    """(3,) common least-squares slope of pieces of one pose, a window."""
     x = [p - p.mean() for p in pieces]
     u = [w.mean[p] - w.mean[p].mean(axis=0) for p in pieces]
     return np.asarray(np.concatenate(x) @ np.concatenate(u) / sum(float(i @ i) for i in x))
 
 
-def worth_keeping(w: Windows, shaken: Ints, quiet: Ints, noise: NoiseScales) -> bool:
+def worth_keeping(w: Windows, vibrating: Ints, quiet: Ints, noise: NoiseScales) -> bool:
     """Whether the mean over both parts of a pose is better than that over the
-    ``quiet`` windows, or not worse by much.
+    ``quiet`` windows, or hardly worse.
 
-    With variances v/n of the means over n windows, a part of n windows makes
-    the mean of m better where its v is below 2 + n/m times the other's.
+    With variances v/n of means over n windows, a part of n windows improves the mean
+    of m if its v is below 2 + n/m times the other's.
     """
     usual = np.maximum(SCALES[-1] * noise.step[SCALES[-1]] ** 2 / 2, _spread(w, quiet))
-    return bool(np.mean(_spread(w, shaken) / usual) < max(MUCH, 2 + len(shaken) / len(quiet)))
+    return bool(np.mean(_spread(w, vibrating) / usual) < max(MUCH, 2 + len(vibrating) / len(quiet)))
 
 
-def disturbances(w: Windows, used: Ints, shaken: Ints) -> Ints:
-    """(j,) the windows of a pose's disturbances, of which ``used`` has none:
-    its ``shaken`` parts with the windows beside them, and bumps that last for
-    longer than a knock."""
-    without = np.union1d(np.setdiff1d(np.arange(used[0], used[-1] + 1), used), shaken)
-    loud = (w.variance[without] > LOUD**2 * w.variance[used].mean(axis=0)).any(axis=1)
+def disturbances(w: Windows, used: Ints, vibrating: Ints) -> Ints:
+    """(j,) windows of a pose's disturbances, none of them in ``used``: its
+    ``vibrating`` parts with the windows next to them, and bumps longer than a
+    knock."""
+    without = np.union1d(np.setdiff1d(np.arange(used[0], used[-1] + 1), used), vibrating)
+    strong = (w.variance[without] > VIBRATING**2 * w.variance[used].mean(axis=0)).any(axis=1)
     least = LASTING_S / (w.period_ns * 1e-9)
     parts = np.split(np.arange(len(without)), np.flatnonzero(np.diff(without) > 1) + 1)
-    lasting = [without[p] for p in parts if loud[p].sum() >= least or np.isin(without[p], shaken).any()]
+    lasting = [without[p] for p in parts if strong[p].sum() >= least or np.isin(without[p], vibrating).any()]
     return np.concatenate([np.zeros(0, dtype=np.int64), *lasting])
 
 
 def _spread(w: Windows, part: Ints) -> Floats:
-    """(3,) variance of a mean over n windows times n, by how averages over a
-    few of them differ."""
+    """(3,) variance of a mean over n windows times n, from differences of averages
+    over a few of them."""
     n = len(part)
     scale = max((s for s in SCALES if n >= BLOCKS * s), default=1)
     together = w.joined[part] & (np.diff(part, prepend=part[0] - 1) == 1)

@@ -153,7 +153,7 @@ def test_shaken_poses_are_the_same_in_blocks_of_any_size(fourteen: np.ndarray) -
     for d in (whole, pieces):
         d.finish()
     found, expected = pieces.spans(), whole.spans()
-    assert [(s.used.tolist(), s.shaken.tolist(), s.parted) for s in found] == [
-        (s.used.tolist(), s.shaken.tolist(), s.parted) for s in expected
+    assert [(s.used.tolist(), s.vibrating.tolist(), s.parted) for s in found] == [
+        (s.used.tolist(), s.vibrating.tolist(), s.parted) for s in expected
     ]
     assert len(whole.spans()) == 14
