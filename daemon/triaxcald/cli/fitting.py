@@ -17,7 +17,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import residuals_by_run, shape_by_poses, shape_of
+from triaxcal.estimate.recordings import gather, residuals_by_run, shape_by_poses, shape_of
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
 from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
