@@ -202,7 +202,7 @@ class _Update:
         self.poses, self.earlier, self.c = poses, earlier, earlier.calibration
         self.u, self.covariates = np.array([p.mean for p in poses]), _covariates(poses, self.c)
         self.noise = self._noise()
-        # R: noise of each pose along the measured vector, and scatter from pose to pose.
+        # R: noise of each pose along the measured vector, and pose-to-pose scatter.
         self.variance = self.noise**2 + earlier.scatter_g**2
         self.pure_dof = within_pose_dof(poses)
         stated = earlier.start_to_start
