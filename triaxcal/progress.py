@@ -25,4 +25,4 @@ class Progress(Protocol):
 
 
 def unreported(stage: Stage, done: float | None = None) -> None:
-    """Where nobody waits."""
+    """The default progress, which reports nothing."""

@@ -1,5 +1,5 @@
-"""The calibration that is handed on: the average as a calibration, with what is
-left in the poses under it."""
+"""The corrected calibration: the model average as a calibration, with the residuals
+of the poses under it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from triaxcal.uncertainty.propagation import extrapolated, gain_given_prior
 
 
 def corrected(before: Calibration, posterior: Posterior, at: ReferenceEpoch) -> tuple[Calibration, Refusal | None]:
-    """The calibration with the likely effects at their mean coefficients, and
-    why no name is corrected in it. ``before`` is the linear calibration of all
-    poses that were given: where no effect is to be corrected (`least_loss`), it
-    stays, with the errors that all likely sets make of it."""
+    """The calibration with the likely effects at their mean coefficients, and the
+    reason for no effects in it. ``before`` is the linear calibration of all given
+    poses: where no effect is corrected (`least_loss`), it stays, with the errors from
+    all likely sets."""
     model_average, refused = least_loss(posterior, at, before.sensor, components(posterior))
     rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in model_average.sensor.effects for name in effect.needs)
@@ -65,8 +65,7 @@ def corrected(before: Calibration, posterior: Posterior, at: ReferenceEpoch) -> 
 
 
 def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, float]:
-    """Of the shapes that stand for the effects, about what the posterior has of
-    them."""
+    """Errors of the shapes in the calibration, about the posterior means."""
     out = {}
     for effect, _ in model_average.sensor.effects:
         for name, shape in shapes_of(posterior, effect.name).items():
@@ -77,8 +76,8 @@ def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, flo
 
 
 def _with_residuals(c: Calibration, rows: LinearisedData, model_average: Average) -> Calibration:
-    """In the recording's own poses, at their own times. Of poses with a fault
-    that lack a channel nothing is known."""
+    """Residuals in the recording's own poses, at their own times; NaN for faulty
+    poses that lack a channel."""
     logged = set.intersection(*(set(p.pose.channels) for p in c.poses if p.used))
     known = [i for i, p in enumerate(c.poses) if logged <= set(p.pose.channels)]
     nan = float("nan")
@@ -131,8 +130,7 @@ def _with_known_residuals(
 
 
 def _leverage(rows: LinearisedData, used: list[int], model_average: Average) -> Floats:
-    """(n,) of those poses: how much each decides its own prediction, where
-    coefficients are held by their sizes."""
+    """(n,) leverage of those poses, with the priors of the coefficients."""
     problem = replace(rows.problem.only(np.array(used)), slopes=None)
     _, J, error = linearise(problem, State.of(problem, model_average.sensor))
     weighted = J / error[:, None]

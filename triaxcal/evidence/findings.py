@@ -1,5 +1,5 @@
-"""What is read off the posterior: names that are known, names that are likely,
-outliers, and what has no name."""
+"""Findings from the posterior: certain names, likely names, outliers, and unmodelled
+parts."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from triaxcal.rounding import reaches
 
 @dataclass(frozen=True)
 class Named:
-    """One of these effects acts for certain, each with its probability, the
-    likeliest first; ``together`` is that of at least one. A name alone is
-    known."""
+    """One of these effects acts for certain; each with its probability, the likeliest
+    first. ``together`` is the probability of at least one. A single name is
+    certain."""
 
     probabilities: Mapping[str, float]
     together: float
@@ -41,20 +41,19 @@ class Named:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Something acts that no name describes: with which ``probability``, of
-    which ``kind`` it is most likely, and how large it then is, as an rms of |a|
-    over the poses, in the unit of the reference."""
+    """An unmodelled part: its ``probability``, its likeliest ``kind``, and its size
+    in that case, as an rms of |a| over the poses, in the unit of the reference."""
 
     probability: float
     kind: UnmodelledKind | None
     rms_g: float
     significant: bool
-    """Whether it is likelier than not."""
+    """Whether its probability exceeds one half."""
 
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """From this pose on there is another unit, or another mounting."""
+    """Another unit, or another mounting, from this pose on."""
 
     pose: int
     probability: float
@@ -62,10 +61,9 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class Findings:
-    """``candidates`` are likely names that are not certain, with their
-    probability; ``nothing`` is the probability that no effect, no outlier and
-    nothing unmodelled acts. ``outliers`` are poses, each with its probability,
-    counted among all that were given."""
+    """``candidates`` are likely names that are not certain, with their probabilities;
+    ``nothing`` is the probability of no effect, no outlier and no unmodelled part.
+    ``outliers`` are indices among all given poses, each with its probability."""
 
     named: tuple[Named, ...]
     candidates: Mapping[str, float]
@@ -76,10 +74,9 @@ class Findings:
 
 
 def stated(found: Findings, probabilities: Mapping[str, float]) -> dict[str, float | None]:
-    """Each of these ``probabilities`` of names, or None where it is not
-    calibrated. The odds before the poses were seen have the truth in the
-    catalogue; where it is in none, a name that is likely and not known is wrong
-    (`benchmarks.components`)."""
+    """Each of these ``probabilities`` of names, or None where it is not calibrated.
+    The prior assumes that the truth is in the catalogue; where it is not, a likely
+    name that is not certain is wrong (`benchmarks.components`)."""
     known = {named.effect for named in found.named if named.unique}
     least = Odds().reported
     return {name: p if name in known or not reaches(p, least) else None for name, p in probabilities.items()}
@@ -124,8 +121,8 @@ def _unexplained(posterior: Posterior) -> Unexplained:
 
 
 def _nothing(posterior: Posterior) -> float:
-    """The empty set is always among the sets, and no unmodelled part always
-    among its parts (`likely_sets`)."""
+    """Probability of the empty set without an unmodelled part; both are always
+    included (`likely_sets`)."""
     weight, empty = next(
         pair for pair in zip(posterior.set_probabilities, posterior.sets, strict=True) if not pair[1].members
     )
@@ -158,21 +155,21 @@ class Why(StrEnum):
 
 @dataclass(frozen=True)
 class NotIdentifiable:
-    """``channel`` is empty where no channel is to blame."""
+    """``channel`` is empty where no channel is the reason."""
 
     why: Why
     channel: str = ""
 
 
 def not_identifiable(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, NotIdentifiable]:
-    """By name, in the order of the ``catalogue``."""
+    """Reasons by name, in the order of the ``catalogue``."""
     shown = {name for name in {term.name for term in evidence.terms} if name and _in_full(evidence, name)}
     return {effect.name: _why(evidence, effect) for effect in catalogue if effect.name not in shown}
 
 
 def _in_full(evidence: Evidence, name: str) -> bool:
-    """Whether no combination of all the coefficients of some shape looks like
-    the nine parameters; apart from those that |a| shows nowhere."""
+    """Whether, for some shape, no combination of all coefficients is equivalent to
+    the nine parameters, except those that |a| never shows."""
     rows = evidence.rows
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
@@ -185,8 +182,8 @@ def _in_full(evidence: Evidence, name: str) -> bool:
 
 
 def _shown_somewhere(evidence: Evidence, effect: Effect) -> Floats:
-    """(p,r) combinations of the coefficients, of which |a| shows each somewhere
-    on the sphere. Of an effect that needs a covariate it shows all."""
+    """(p,r) combinations of the coefficients that |a| shows somewhere on the sphere.
+    For an effect with a covariate these are all."""
     p = len(effect.coefficients)
     if effect.needs:
         return np.eye(p)

@@ -200,12 +200,11 @@ rounding."""
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """``columns`` (N,q) are those of coefficients of size one, so that ρ times
-    them has the rms ρ; ``combination`` (q,) what they were multiplied by.
-    ``kind`` is the same for terms that exclude each other; ``pose`` is the
-    outlier's, or −1; ``change_point`` is the pose from which on there is
-    another unit or mounting, or −1; ``kept`` are those coefficients of the
-    ``effect`` that are free."""
+    """``columns`` (N,q) are scaled to coefficients of size one, so that ρ times them
+    has the rms ρ; ``combination`` (q,) are the scale factors. ``kind`` is equal for
+    terms that exclude each other; ``pose`` is the outlier's, or −1; ``change_point``
+    is the first pose of another unit or mounting, or −1; ``kept`` are the free
+    coefficients of the ``effect``."""
 
     name: str
     kind: str
@@ -237,10 +236,9 @@ def variant_of(effect: Effect) -> Variant:
 def terms_of(
     rows: LinearisedData, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = (), near: int | None = None
 ) -> list[Term]:
-    """Every form, shape and choice of axes of every effect that can act in
-    these poses, every pose as an outlier, and the poses of `change_points` as
-    the first of another unit or mounting. ``finer`` are divisions of shapes,
-    one after the other."""
+    """Every form, shape and choice of axes of every effect that can act in these
+    poses, every pose as an outlier, and the poses of `change_points` as the first of
+    another unit or mounting. ``finer`` are successive divisions of shapes."""
     still = static_covariates(rows.poses)
     known = rows.problem.channel_reference
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
@@ -300,7 +298,7 @@ def _of_effect(
 
 
 def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Effect, float]]:
-    """The variants, and with which share of the prior."""
+    """The variants, with their shares of the prior."""
     out = [(shape, 1 / len(shapes)) for shape in shapes]
     for division in finer:
         each = [(division.get(variant_of(shape), (shape,)), share) for shape, share in out]
@@ -309,12 +307,11 @@ def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Eff
 
 
 def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | None:
-    """Derivatives of the rows by the coefficients (N,p), and the size of each
-    (p,): the rms of what a coefficient of one adds over the sphere and over the
-    poses' covariates, about its mean over these. Of one part of a function of
-    the force alone, coefficients in one unit are equally probable before the
-    poses are seen, and so have the rms of their sizes: they may look the same
-    in |a|. None where it cannot be determined."""
+    """Derivatives of the rows by the coefficients (N,p), and the size of each (p,):
+    rms contribution of a unit coefficient over the sphere and the poses' covariates,
+    about its mean over these. Coefficients of one part and unit in a function of the
+    force alone are equally probable a priori and share the rms of their sizes, as
+    they may look the same in |a|. None where it cannot be determined."""
     try:
         columns = rows.by_coefficients(effect)
         covariates = rows.problem.covariates
@@ -337,7 +334,7 @@ def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | No
 
 
 def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:
-    """Its mean is off, and its slope with it."""
+    """A term for an outlying mean, and slope, of one pose."""
     own = np.array([pose, rows.n + pose] if rows.slopes else [pose])
     combination = np.full(len(own), 1 / np.sqrt(len(own)))
     columns = ScaledColumns(None, own, combination / rows.error[own], len(rows.y))
@@ -345,7 +342,7 @@ def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:
 
 
 def change_points(n: int) -> Ints:
-    """How many of n poses are before each change that is looked at."""
+    """Numbers of poses before each change point of the grid."""
     return evenly_spread(np.arange(FEWEST, n - FEWEST + 1), CHANGE_POINTS)
 
 
@@ -364,8 +361,8 @@ def _change_points(n: int, near: int | None) -> Mapping[int, int]:
 
 
 def _another(rows: LinearisedData, odds: Odds, near: int | None) -> Iterator[Term]:
-    """From a pose on all nine parameters are others: another unit, channels
-    that were exchanged."""
+    """Terms with other values of all nine parameters from a pose on: another unit, or
+    exchanged channels."""
     order = rows.order
     size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))
     combination = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))

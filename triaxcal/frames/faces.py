@@ -62,7 +62,7 @@ TURNS: Floats = _proper()
 
 
 class Miscounted(InvalidData):
-    """There are more labels, or fewer, than anything that they may be of."""
+    """The number of labels fits neither poses nor faces."""
 
 
 @dataclass(frozen=True)
@@ -106,24 +106,27 @@ def nearest_rotation(up: Floats, axes: Floats) -> Floats:
 
 
 def recognise(up: Floats, used: Bools) -> Labelling:
-    """Face poses by direction alone, the axes of the sensor taken near the
-    body's. Raises Refused where there are none.
+    """Face poses by direction alone, with the axes of the sensor near the body's.
+    Raises Refused where there are none.
 
-    Of the frames whose axes run through the poses, those are preferred that
-    have most poses on their axes, twice counted up to two a face, and of those
-    as good the one nearest to the sensor's own.
+    Among the frames with axes through the poses, the best have the most poses on
+    their axes, counting up to two a face; of equally good ones the nearest to the
+    sensor's frame is used.
     """
+    # Rotate every frame by the 24 rotations of the cube to the nearest one.
     frames, scores = _frames(up[used])
     if not len(frames):
         raise Refused("no two poses at right angles: none stand on the faces of a cube", wanted=LABELS)
     traces = np.einsum("tij,fji->ft", TURNS, frames)
     frames = TURNS[np.argmax(traces, axis=1)] @ frames
     near = traces.max(axis=1)
+    # The nearest of the good frames, then the best of its neighbours.
     good = scores >= AS_GOOD * scores.max()
     best = frames[np.argmax(np.where(good, near, -4.0))]
     alike = np.einsum("fij,ij->f", frames, best) > 1 + 2 * np.cos(2 * NEAR_RAD)
     best = frames[np.argmax(np.where(alike, scores + 0.1 * near, -1.0))]
     rival = good & (np.max(np.einsum("fij,tik,kj->ft", frames, TURNS, best), axis=1) < 1 + 2 * np.cos(0.2))
+    # Alternate between assignment of the poses and the rotation.
     labels = _on_faces(up, used, best)
     for _ in range(3):
         mounting = _mounting(up, labels)
@@ -201,6 +204,7 @@ def _check(up: Floats, labels: Sequence[str | None], mounting: Floats) -> None:
     off = _angles(up[rows] @ mounting.T, axes)
     if off.max() <= LABEL_RAD:
         return
+    # Test whether a mirror image fits.
     u, _, vt = np.linalg.svd(axes.T @ up[rows])
     if np.linalg.det(u @ vt) < 0 and _angles(up[rows] @ (u @ vt).T, axes).max() <= LABEL_RAD:
         raise InvalidData(
@@ -227,8 +231,9 @@ def _on_faces(up: Floats, used: Bools, mounting: Floats) -> tuple[str | None, ..
 
 
 def _frames(up: Floats) -> tuple[Floats, Floats]:
-    """Rotations (f,3,3) with poses on at least two of their axes, and their
-    scores (f,)."""
+    """Rotations (f,3,3) with poses on at least two of their axes, and their scores
+    (f,)."""
+    # Frames from all pairs of nearly perpendicular poses (Gram–Schmidt).
     seeds = up[:SEEDS_MOST]
     i, j = np.nonzero(np.triu(np.abs(seeds @ seeds.T) < np.sin(NEAR_RAD), 1))
     x = seeds[i]

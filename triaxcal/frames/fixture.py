@@ -1,5 +1,4 @@
-"""The errors of a fixture's own faces, and which of them do not depend on the
-frame they are expressed in."""
+"""Errors of a fixture's faces, and those that do not depend on the frame."""
 
 from __future__ import annotations
 
@@ -21,18 +20,17 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Fixture:
-    """Faces by the label of what is up on them. ``up`` (f,3) their inward
-    normals in the body's frame.
+    """Faces by the label of the side that is up. ``up`` (f,3) their inward normals in
+    the body's frame.
 
-    ``error`` (f,3) how far these are from the axes, rad, along the body's axes;
-    ``covariance`` (3f,3f) of all of them. ``squareness`` by pair of axes (XY,
-    YZ, ZX): how far the mean normals of their faces are from a right angle,
-    positive where the angle is smaller. ``parallelism`` by axis: half of what
-    its two faces lack to be parallel, as the mean of both inward normals, along
-    the two other axes in cyclic order. Both do not depend on the datum.
-    ``offset`` (3,) rad: standard error, about the body's axes, of the datum
-    against the frame that faces with independent errors of this size were made
-    to; None where nothing shows that size.
+    ``error`` (f,3) rad: deviations of the normals from the axes, along the body's
+    axes; ``covariance`` (3f,3f) of all. ``squareness`` by pair of axes (XY, YZ, ZX):
+    deviation of the mean normals from a right angle, positive for a smaller angle.
+    ``parallelism`` by axis: half of the deviation of its two faces, as the mean of
+    both inward normals, along the two other axes in cyclic order. Neither depends on
+    the datum. ``offset`` (3,) rad: standard error, about the body's axes, of the
+    datum against the frame to which faces with independent errors of this size were
+    made; None where that size is not known.
     """
 
     faces: tuple[str, ...]
@@ -50,14 +48,15 @@ class Fixture:
 
 
 def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Floats, datum: Floats) -> Fixture:
-    """``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2); ``datum``
-    (3,2f): what of their errors there it makes zero."""
+    """The fixture with ``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2);
+    ``datum`` (3,2f) are the combinations of their errors that it sets to zero."""
     nominal = np.array([axis_of(label) for label in faces])
     spread = np.zeros((3 * len(faces), 2 * len(faces)))
     for k in range(len(faces)):
         # What a normal loses along its own axis is of second order, and no
         # error of the face.
         spread[3 * k : 3 * k + 3, 2 * k : 2 * k + 2] = axes[k] - np.outer(nominal[k], nominal[k] @ axes[k])
+    # Deviation of each normal across its own axis.
     error = up - nominal * np.sum(nominal * up, axis=1, keepdims=True)
     V = spread @ covariance @ spread.T
     flat = error.ravel()
@@ -81,6 +80,7 @@ def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Flo
                 mean[a, b] = np.sum([component(x, b) * axis_of(x)[a] for x in here], axis=0) / len(here)
             if a in both and a != b:
                 half[a, b] = np.sum([component(x, b) for x in here], axis=0) / 2
+    # Squareness and parallelism as linear combinations of the errors.
     squareness = {
         "XYZ"[a] + "XYZ"[b]: quantity(mean[a, b] + mean[b, a])
         for a, b in ((0, 1), (1, 2), (2, 0))
@@ -99,7 +99,7 @@ def _offset(nominal: Floats, axes: Floats, error: Floats, V: Floats, datum: Floa
     shape = np.eye(len(B)) - B @ np.linalg.pinv(B)  # errors as the least-squares frame has them, whatever the datum
     rest = shape @ error.ravel()
     variance = max(float(rest @ rest) - float(np.trace(shape @ V @ shape)), 0.0) / left
-    # The datum turns by what makes its share of the faces' errors zero.
+    # Rotation of the datum by the errors that it sets to zero.
     across = (axes.transpose(0, 2, 1) @ turns).reshape(-1, 3)
     turned = np.linalg.solve(datum @ across, datum)
     return np.asarray(np.sqrt(variance * np.sum(turned**2, axis=1)))
@@ -122,8 +122,8 @@ class SyntheticFixture:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, face_error: float = 1e-3, tilt: float = 1e-3) -> SyntheticFixture:
-        """Normals off by Gaussian angles of ``face_error`` rad about each axis,
-        a table tilted by exactly ``tilt``."""
+        """Normals with Gaussian errors of ``face_error`` rad about each axis, and a
+        table tilted by exactly ``tilt`` rad."""
         inward = {}
         for label in LABELS:
             v = axis_of(label) + np.cross(rng.normal(0.0, face_error, 3), axis_of(label))
@@ -154,8 +154,8 @@ class SyntheticFixture:
 
 
 def _axes(normal: Floats, along: Floats) -> Floats:
-    """(3,3): columns along ``along`` laid square to ``normal``, normal × that,
-    and ``normal``."""
+    """(3,3): columns ``along``, made perpendicular to ``normal``, normal × that, and
+    ``normal``."""
     x = along - (along @ normal) * normal
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(normal, x), normal], axis=1)

@@ -1,8 +1,8 @@
-"""In which orientations a fixture stood on each of its faces, and what these
-tell of the table's tilt.
+"""Orientations of a fixture on each of its faces, and the tilt of the table.
 
-Headings that nobody gave are found as far as they matter: the poses on a face
-are split in two, half a turn apart."""
+Unknown headings are found as far as they matter: the poses on a face are split in two
+groups half a turn apart.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
 from triaxcal.poses.pose import Pose, PoseStart
 
-# Which way is up in a unit's still poses, in the sensor's frame, and how uncertain
-# that is.
+# The direction of up in a unit's still poses, in the sensor's frame, with its
+# covariance.
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Verticals:
     """``direction`` (n,3) of up in each pose, unit vectors, sensor frame;
     ``covariance`` (3n,3n) of all, rad².
 
-    The covariance holds the noise of the poses and what the uncertainty of the
-    calibration adds, which is common to all poses. ``used`` (n,): poses that
-    are no outliers. ``dof`` behind the covariance.
+    The covariance contains the noise of the poses and the uncertainty of the
+    calibration, which all poses share. ``used`` (n,): poses that are no outliers.
+    ``dof`` of the covariance.
     """
 
     poses: tuple[Pose, ...]
@@ -43,7 +43,7 @@ class Verticals:
 
 
 def verticals(calibration: Calibration) -> Verticals:
-    """Of the poses that the calibration was fitted to."""
+    """Verticals in the poses to which the calibration was fitted."""
     results = calibration.poses
     poses = tuple(r.pose for r in results)
     used = np.array([r.used for r in results])
@@ -72,11 +72,11 @@ def verticals_under(
     reference: float = 1.0,
     moment: tuple[float, float] | None = None,
 ) -> Verticals:
-    """Of poses of another recording than the calibration's; ``covariance``
+    """Verticals in poses of another recording than the calibration's; ``covariance``
     (p,p) of `Calibration.parameters`.
 
-    Effects of time count as at one ``moment``
-    (`triaxcal.poses.covariates.of_moment`), since its clock is its own. Raises
+    Effects of time are evaluated at one ``moment``
+    (`triaxcal.poses.covariates.of_moment`), since the clock is another. Raises
     InvalidData where a channel that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
@@ -94,32 +94,35 @@ def _directions(
     used: Bools,
     excess_g: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Up (n,3), and the covariance (3n,3n) of all, where that of the parameters
-    is P (p,p).
+    """Up (n,3), and its covariance (3n,3n), for the covariance P (p,p) of the
+    parameters.
 
-    |a| is known, so the residual r = |a| − reference is noise along the
-    measured vector, and with it goes that part of the noise across which is
-    correlated with it (noise that differs by axis): the estimate is a − N v r /
-    (vᵀ N v), N the noise of a. What noise is left is independent of the
-    residuals, hence of the errors of a calibration that was fitted to the same
-    poses.
+    |a| is known, so the residual r = |a| − reference is noise along the measured
+    vector v. With noise that differs by axis, the noise across is correlated with it,
+    and the estimate is a − N v r / (vᵀ N v), N the covariance of a. The remaining
+    noise is independent of the residuals, hence of the errors of a calibration that
+    was fitted to the same poses.
     """
     u = np.array([p.mean for p in poses])
     a, by_u, by_parameter = sensor.specific_force_and_derivatives(u, covariates)
     length = np.linalg.norm(a, axis=1)
     if not np.all(length > 0):
         raise InvalidData("a pose reads no specific force at all under the calibration")
+    # Covariance N of the specific force, from outputs and excess variance.
     noise = by_u @ np.array([p.covariance for p in poses]) @ by_u.transpose(0, 2, 1) + excess_g**2 * np.eye(3)
     v = a / length[:, None]
+    # Subtract the noise along v that the residual shows, and normalise.
     along = np.einsum("nij,nj->ni", noise, v)
     gain = along * (used / np.maximum(np.einsum("ni,ni->n", v, along), 1e-300))[:, None]
     direction = a - gain * (length - reference)[:, None]
     size = np.linalg.norm(direction, axis=1, keepdims=True)
     direction = direction / size
+    # Derivatives by the parameters: direct, and through the residual.
     J = np.einsum("ni,nip->np", v, by_parameter)
     n = len(u)
     D = (by_parameter - gain[:, :, None] * J[:, None, :]).reshape(3 * n, -1)
     V = D @ P @ D.T
+    # Noise of every pose, and the projection across the direction.
     across = np.zeros((3 * n, 3 * n))
     for i in range(n):
         block = slice(3 * i, 3 * i + 3)
@@ -129,31 +132,30 @@ def _directions(
 
 
 FLOOR_RAD = 1e-12
-"""Standard error of a direction that has no noise, as in a simulation: keeps
-the weights finite, and is far below what any pose tells."""
+"""Standard error of a direction without noise, as in a simulation: it keeps the
+weights finite, and is far below the noise of any pose."""
 SHOWS = 1e-4
-"""Probability below which a tilt, or a face that was not turned, is more than
-noise."""
+"""Probability below which a tilt, or a face that was not turned, is significant."""
 PAIRS_LEAST = 3
-"""So many faces that agree on the tilt are needed to conclude it for a face
-that stood one way only."""
+"""Number of faces with equal tilt from which the tilt of a face with one orientation
+is inferred."""
 SHORT = 0.95
-"""The share of the tilt that a turn by 143° shows."""
+"""Share of the tilt that a turn by 143° shows."""
 SPLIT_MOST = 12
-"""Poses on one face of which every split in two is tried, 2048 of twelve; with
-each more there are twice as many."""
+"""Largest number of poses on a face for which all splits in two are tried (2048 of
+twelve)."""
 APART_RAD = 0.2
-"""Orientations that differ by less, 11°, are one: a fifth of a tilt shows
-between them."""
+"""Orientations that differ by less, 11°, count as one: they show a fifth of a
+tilt."""
 LARGE_RAD = 0.01
-"""Tilts and errors of faces beyond this are asked about: a fixture's are far
-smaller, and poses of a unit in the hand lie on a cube by chance."""
+"""Tilts and errors of faces beyond this cause a warning: those of a fixture are far
+smaller, and poses of a hand-held unit lie on a cube only by chance."""
 
 
 @dataclass(frozen=True)
 class NotTurned(Caution):
-    """The poses with a face up differ less than half a turn makes them on the
-    others: taken as not turned by that."""
+    """The poses with a face up differ by less than half a turn causes on the others;
+    they count as not turned."""
 
     face: str
     began: PoseStart
@@ -161,8 +163,8 @@ class NotTurned(Caution):
 
 @dataclass(frozen=True)
 class NotFlush(Caution):
-    """The poses with a face up differ by ``angle_rad``, far more than on the
-    other faces."""
+    """The poses with a face up differ by ``angle_rad``, far more than on the other
+    faces."""
 
     face: str
     began: PoseStart
@@ -171,11 +173,11 @@ class NotFlush(Caution):
 
 @dataclass(frozen=True)
 class Assumed:
-    """What the user knows: standard errors of one seating of the fixture and of
-    a turn, and the table's tilt [rad].
+    """Values stated by the user [rad]: standard errors of one seating of the fixture
+    and of a turn, and the table's tilt.
 
-    None where it is to be found from the poses. ``turn`` is that of a half
-    turn, or of a heading that is given.
+    None where the poses determine the value. ``turn`` is that of a half turn, or of a
+    given heading.
     """
 
     seating: float | None = None
@@ -190,8 +192,8 @@ class Assumed:
 
 @dataclass(frozen=True)
 class Face:
-    """``rows`` of the poses on it, ``turn`` (n,) rad: headings where
-    ``headed``, else counted from the first pose."""
+    """``rows`` of the poses on it, ``turn`` (n,) rad: headings where ``headed``, else
+    relative to the first pose."""
 
     label: str
     rows: tuple[int, ...]
@@ -209,27 +211,29 @@ class Face:
 
     @property
     def resolved(self) -> bool:
-        """Whether orientations differ."""
+        """Whether the face has several orientations."""
         return bool(np.any(1 - np.cos(self.turn[:, None] - self.turn[None, :]) > 1 - np.cos(APART_RAD)))
 
 
 def felt(turn: float) -> Floats:
-    """(2,2): the table's tilt in the axes of a face (`standing.basis_of`) that
-    has turned by ``turn``."""
+    """(2,2): the table's tilt in the axes of a face (`standing.basis_of`) after a
+    rotation by ``turn``."""
     c, s = np.cos(turn), np.sin(turn)
     return np.array([[c, s], [-s, c]])
 
 
 def _turns(found: Verticals, rows: Sequence[int]) -> Floats:
-    """(n,): half turns from the first pose, by the split in two whose means are
-    farthest apart; or quarter turns.
+    """(n,): half turns from the first pose, by the split in two groups with the most
+    distant means; or quarter turns.
 
-    Quarter turns where half turns leave far more than noise and quarter turns a
-    small part of that.
+    Quarter turns where half turns leave far more than noise, and quarter turns less
+    than a quarter of that.
     """
     up = found.direction[list(rows)]
     second = _farthest_halves(up)
     turn = np.where(second, np.pi, 0.0)
+    # Compare the residuals of half and quarter turns, with the face's normal and the
+    # tilt fitted.
     y, noise = _flat(found, rows)
     left = 2 * len(rows) - 4
     if left <= 0:
@@ -244,13 +248,14 @@ def _turns(found: Verticals, rows: Sequence[int]) -> Floats:
 
 
 def _farthest_halves(up: Floats) -> Bools:
-    """(n,): not with the first pose."""
+    """(n,): whether each pose is in the other group than the first."""
     n = len(up)
     if n > SPLIT_MOST:  # the direction of most scatter divides them
         centred = up - up.mean(axis=0)
         along = centred @ np.linalg.svd(centred)[2][0]
         return np.asarray((along > 0) != (along[0] > 0))
     best, farthest = np.zeros(n, dtype=bool), -1.0
+    # The split with the largest sum of squares between the groups.
     for code in range(1, 2 ** (n - 1)):
         second = np.array([False, *(bool(code >> i & 1) for i in range(n - 1))])
         gap = up[second].mean(axis=0) - up[~second].mean(axis=0)
@@ -261,12 +266,12 @@ def _farthest_halves(up: Floats) -> Bools:
 
 
 def _felt_by(turn: Floats) -> Floats:
-    """(2n,4): poses by the face's normal and the table's tilt."""
+    """(2n,4): derivatives of the poses by the face's normal and the table's tilt."""
     return np.concatenate([np.hstack([np.eye(2), felt(t)]) for t in turn])
 
 
 def _flat(found: Verticals, rows: Sequence[int]) -> tuple[Floats, Floats]:
-    """(2n,) up in the poses of one face, in axes square to its mean, x × y
+    """(2n,) up in the poses of one face, in axes perpendicular to its mean, x × y
     along it; and its covariance."""
     up = found.direction[list(rows)]
     m = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
@@ -277,8 +282,7 @@ def _flat(found: Verticals, rows: Sequence[int]) -> tuple[Floats, Floats]:
 
 
 def _tilt_on(face: Face, found: Verticals) -> tuple[float, float]:
-    """Magnitude of the table's tilt as one face alone shows it, and its
-    standard error."""
+    """Magnitude of the table's tilt from one face alone, and its standard error."""
     y, covariance = _flat(found, face.rows)
     gain = np.linalg.pinv(_felt_by(face.turn))[2:]
     d = gain @ y
@@ -288,18 +292,19 @@ def _tilt_on(face: Face, found: Verticals) -> tuple[float, float]:
 
 
 def pairs_of(faces: Sequence[Face], found: Verticals) -> list[tuple[Face, float, float]]:
-    """Faces in more than one orientation at unknown headings: the tilt's
-    magnitude there and its standard error."""
+    """Faces with several orientations at unknown headings: magnitude of the tilt, and
+    its standard error."""
     return [(f, *_tilt_on(f, found)) for f in faces if not f.headed and f.resolved]
 
 
 def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Caution]]:
-    """The faces, those that were seemingly not turned between their poses as in
-    one orientation; and cautions."""
+    """The faces, with those that were apparently not turned reduced to one
+    orientation; and cautions."""
     cautions: list[Caution] = []
     pairs = pairs_of(faces, found)
     size = np.array([m for _, m, _ in pairs])
     still = set()
+    # Compare the tilt of each face with the median of the others.
     for k, (face, m, error) in enumerate(pairs):
         rest = np.delete(size, k)
         if len(rest) < PAIRS_LEAST - 1:
@@ -322,8 +327,8 @@ def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Cautio
 
 
 def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:
-    """rms tilt where it is resolved. Raises Refused where too few faces show
-    one."""
+    """Rms tilt of the faces that resolve it. Raises Refused where too few faces
+    do."""
     pairs = pairs_of(faces, found)
     chi2 = sum((m / error) ** 2 for _, m, error in pairs)
     if len(pairs) < PAIRS_LEAST or chi2_sf(chi2, 2 * len(pairs)) > SHOWS:

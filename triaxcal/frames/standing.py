@@ -1,12 +1,11 @@
-"""A unit on the faces of its fixture, on a table that is not level: which way
-each face is, and how the table tilts.
+"""A unit on the faces of its fixture, on a table that is not level: directions of the
+faces and tilt of the table.
 
-A fixture that stands on face k at heading ψ has up at ``cos τ m + B d`` in its
-own frame: m the inward normal of that face, B (3,2) two axes at right angles to
-it, d (2,) the tilt of the table as the fixture feels it, |d| = sin τ. Half a
-turn about the normal turns d into −d and leaves m: the sum of two such poses is
-along m, however large the tilt. Of a face that stood one way only, d is not
-distinguished from m.
+A fixture on face k at heading ψ has up at ``cos τ m + B d`` in its own frame: m the
+inward normal of that face, B (3,2) two axes perpendicular to it, d (2,) the tilt of
+the table in the fixture's axes, |d| = sin τ. Half a turn about the normal changes d
+into −d and leaves m: the sum of two such poses is along m for any tilt. With one
+orientation only, d is not distinguished from m.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ two do from where a former solution ended. More cost time alone."""
 
 @dataclass(frozen=True)
 class FaceTilt:
-    """The table's tilt as felt on one face. ``tilt`` (2,) in the face's axes,
-    in the orientation recorded first.
+    """The table's tilt on one face. ``tilt`` (2,) rad in the face's axes, in the
+    orientation recorded first.
 
-    ``poses`` are indices; ``resolved`` where the orientations on this face tell
+    ``poses`` are indices; ``resolved`` where the orientations on this face separate
     the tilt from the face's direction.
     """
 
@@ -60,7 +59,7 @@ class FaceTilt:
 
     @property
     def standard_error(self) -> float:
-        """Of the magnitude, where that is more than noise."""
+        """Standard error of the magnitude, where this exceeds the noise."""
         along = self.tilt / max(self.magnitude, 1e-300)
         return float(np.sqrt(max(float(along @ self.covariance @ along), 0.0)))
 
@@ -88,8 +87,8 @@ class Table:
 
 @dataclass(frozen=True)
 class SeatingsDiffer(Caution):
-    """By more than the noise: ``seating_rad`` each, from ``dof`` degrees of
-    freedom; the uncertainties contain that."""
+    """Seatings differ by more than the noise: ``seating_rad`` each, from ``dof``
+    degrees of freedom; the uncertainties include that."""
 
     seating_rad: float
     dof: int
@@ -97,8 +96,7 @@ class SeatingsDiffer(Caution):
 
 @dataclass(frozen=True)
 class NoSecondOrientation(Caution):
-    """The tilt of the table enters the rotation in full, with the size that was
-    given."""
+    """The tilt of the table enters the rotation in full, with the stated size."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +157,15 @@ def basis_of(label: str, up: Floats, mounting: Floats) -> Floats:
 
 
 def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None) -> Standing:
-    """Normals of the faces and the table's tilt. Raises Refused where the tilt
-    is confounded with the faces."""
+    """Normals of the faces and the table's tilt. Raises Refused where the tilt is
+    confounded with the faces."""
     assumed = assumed or Assumed()
+    # Orientations on every face, and the prior tilt where they do not resolve it.
     faces = [Face.of(found, labelling, label) for label in labelling.faces]
     faces, of_faces = turned(faces, found)
     prior = _prior_tilt(faces, assumed)
     seating, dof = assumed.seating or 0.0, 0
+    # Solve without seating error; estimate it where the misfit is significant.
     solved = _solve(found, labelling, faces, prior, seating)
     left, chi2 = _misfit(solved)
     p = float(chi2_sf(chi2, left)) if left else None
@@ -173,6 +173,7 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
         begin, dof = solved.up, left
         seating = _seating(lambda s: _misfit(_solve(found, labelling, faces, prior, s, begin))[1], left)
         solved = _solve(found, labelling, faces, prior, seating, begin)
+    # Covariance of the normals, with the error of half turns.
     covariance = solved.covariance[: 2 * len(faces), : 2 * len(faces)]
     covariance = covariance + _turning(solved, assumed.turn)
     part = solved.gain[: 2 * len(faces)]
@@ -196,8 +197,8 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
 
 
 def _prior_tilt(faces: Sequence[Face], assumed: Assumed) -> float:
-    """The tilt to be reckoned with where the orientations do not resolve it; 0
-    where that is nowhere."""
+    """Prior tilt where the orientations do not resolve it: stated, or −1 for that of
+    the other faces; 0 where all resolve it."""
     headed = [f for f in faces if f.headed]
     single = [f for f in faces if not f.headed and not f.resolved]
     if not single and (not headed or any(f.resolved for f in headed)):
@@ -209,8 +210,8 @@ def _prior_tilt(faces: Sequence[Face], assumed: Assumed) -> float:
 
 @dataclass(frozen=True)
 class _Solved:
-    """``covariance`` of normals and tilts together, ``gain`` of them by the
-    observations, residuals weighted."""
+    """Joint solution: ``covariance`` of normals and tilts, ``gain`` from the
+    observations to them, weighted residuals."""
 
     up: Floats
     basis: Floats
@@ -224,8 +225,8 @@ class _Solved:
 
 
 def _design(faces: Sequence[Face]) -> tuple[Floats, int]:
-    """(2n, 2f + 2t): observations by normals and tilts. A tilt for each face
-    without headings, one for all others."""
+    """(2n, 2f + 2t): derivatives of the observations by normals and tilts. One tilt
+    for each face without headings, one for all others."""
     own = [f.label for f in faces if not f.headed]
     columns = 2 * (len(faces) + len(own) + any(f.headed for f in faces))
     blocks = []
@@ -240,13 +241,13 @@ def _design(faces: Sequence[Face]) -> tuple[Floats, int]:
 
 
 def _prior(faces: Sequence[Face], up: Floats, basis: Floats, variance: float, columns: int) -> Floats:
-    """(columns, columns) information on tilts that the orientations do not
-    resolve, ``variance`` of a component.
+    """(columns, columns) prior information on unresolved tilts, with ``variance`` of
+    a component.
 
-    That is τ²/2 where the heading is unknown. The headings of different faces
-    are not independent of each other: rolled over the table from face to face,
-    a fixture feels the tilt as one rotation. So the tilts are taken as a
-    rotation of that variance, and as much again independent of each other.
+    The variance is τ²/2 for an unknown heading. Headings of different faces are
+    correlated: rolled over the table from face to face, a fixture sees the tilt as
+    one rotation. So the tilts are a rotation of that variance, plus independent parts
+    of the same variance.
     """
     information = np.zeros((columns, columns))
     own = [f.label for f in faces if not f.headed]
@@ -270,7 +271,8 @@ def _solve(
     seating: float,
     begin: Floats | None = None,
 ) -> _Solved:
-    """``begin`` (f,3): normals from a solution near by, if there is one."""
+    """The joint solution; ``begin`` (f,3) are normals of a solution near by, if there
+    is one."""
     rows = [i for f in faces for i in f.rows]
     face_of = np.concatenate([np.full(len(f.rows), k) for k, f in enumerate(faces)])
     H, own = _design(faces)
@@ -279,6 +281,7 @@ def _solve(
     index = np.concatenate([3 * r + np.arange(3) for r in rows])
     V3 = found.covariance[np.ix_(index, index)]
     up = np.array([labelling.mounting.T @ axis_of(f.label) for f in faces]) if begin is None else begin
+    # Gauss–Newton: axes at the present normals, weights, and a regularised solution.
     for _ in range(ROUNDS if begin is None else 2):
         basis = np.array([basis_of(f.label, up[k], labelling.mounting) for k, f in enumerate(faces)])
         across = np.zeros((2 * len(rows), 3 * len(rows)))
@@ -323,8 +326,8 @@ def _tilts(faces: Sequence[Face], x: Floats, covariance: Floats) -> tuple[FaceTi
 
 
 def _misfit(solved: _Solved) -> tuple[int, float]:
-    """Degrees of freedom and chi-square of what repeated seatings and the
-    table's one tilt leave over."""
+    """Degrees of freedom and chi-square of repeated seatings and of the common
+    tilt."""
     left, chi2 = solved.left, solved.chi2
     pairs = _telling(solved)
     if len(pairs) > 1:
@@ -336,8 +339,8 @@ def _misfit(solved: _Solved) -> tuple[int, float]:
 
 
 def _telling(solved: _Solved) -> list[FaceTilt]:
-    """Tilts of single faces, where together they are so much more than noise
-    that their magnitudes compare."""
+    """Tilts of single faces, where most are significant enough to compare their
+    magnitudes."""
     if solved.vector is not None:
         return []
     pairs = [t for t in solved.tilts if t.resolved]
@@ -346,8 +349,8 @@ def _telling(solved: _Solved) -> list[FaceTilt]:
 
 
 def _seating(chi2_at: Callable[[float], float], left: int) -> float:
-    """The standard error of a seating at which the misfit is what noise makes
-    it on average (Paule, Mandel 1982)."""
+    """Standard error of a seating with which chi-square equals its degrees of freedom
+    (Paule and Mandel 1982)."""
     high = 1e-6
     while chi2_at(high) > left and high < 1:
         high *= 4
@@ -355,7 +358,7 @@ def _seating(chi2_at: Callable[[float], float], left: int) -> float:
 
 
 def _turning(solved: _Solved, turn: float) -> Floats:
-    """(2f,2f): a half turn that is off by δ leaves d δ/2 of the tilt, square to
+    """(2f,2f): a half turn with an error δ leaves d δ/2 of the tilt, perpendicular to
     it."""
     n = 2 * len(solved.tilts)
     out = np.zeros((n, n))
@@ -395,7 +398,7 @@ def _table(solved: _Solved, assumed: Assumed, p: float | None) -> tuple[Table, l
 
 
 def _rms(tilts: Sequence[FaceTilt]) -> float:
-    """Of the magnitude, less what noise adds to its square."""
+    """Rms magnitude, less the contribution of the noise to its square."""
     squares = [float(t.tilt @ t.tilt - np.trace(t.covariance)) for t in tilts]
     return float(np.sqrt(max(float(np.mean(squares)), 0.0)))
 

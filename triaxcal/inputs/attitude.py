@@ -1,12 +1,13 @@
-"""Calibration from poses of known attitude: a turntable, or a cube on a
-levelled plate (the paper's traditional way).
+"""Calibration from poses of known attitude: a turntable, or a cube on a levelled
+plate (the paper's traditional way).
 
-``u = P g + c`` with ``g`` the reference vector in the table's frame, which the
-attitude gives, ``P = K R C`` (3,3) and ``c = K b``: twelve parameters, the nine
-of the sensor and the rotation C from the table's frame to the sensor's, which
-magnitudes cannot show. Attitudes err too. Their error is a nuisance of two
-angles a pose with a variance of its own: where it is large against the noise
-the magnitude still counts in full, and the fit tends to that of the ellipsoid."""
+``u = P g + c`` with ``g`` the reference vector in the table's frame, from the
+attitude, ``P = K R C`` (3,3) and ``c = K b``: twelve parameters, the nine of the
+sensor and the rotation C from the table's frame to the sensor's, which magnitudes do
+not show. Errors of the attitudes are nuisances, two angles a pose with a variance of
+their own. Where they are large against the noise, the magnitude still counts in full,
+and the fit tends to that of the ellipsoid.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +42,12 @@ from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, lack_of_fit_p, within
 from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.poses.pose_in_words import the_poses
 
-# What speaks against a fit to poses of known attitude.
+# Cautions of a fit to poses of known attitude.
 
 
 @dataclass(frozen=True)
 class Row:
-    """One of the attitudes that were given, by its name, and when its pose
-    began."""
+    """A given attitude by name, and the beginning of its pose."""
 
     name: str
     began: PoseStart
@@ -62,7 +62,7 @@ class AttitudesTied(Caution):
 
 @dataclass(frozen=True)
 class AttitudeExcluded(Caution):
-    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the
+    """The attitude is wrong by ``off_rad``; the pose was measured with ``up`` in the
     table's frame."""
 
     row: Row
@@ -72,19 +72,18 @@ class AttitudeExcluded(Caution):
 
 @dataclass(frozen=True)
 class AttitudesContradict(Caution):
-    """Each other, by more than noise; ``error_rad`` by axis is estimated from
-    that."""
+    """The attitudes contradict each other by more than noise; ``error_rad`` by axis
+    is estimated from that."""
 
     error_rad: float
 
 
 @dataclass(frozen=True)
 class DeclaredErrorContradicted(Caution):
-    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``;
-    ``declared_rad`` stays in force.
+    """The residuals contradict the declared error: they give ``error_rad`` ±
+    ``uncertainty_rad``; ``declared_rad`` stays in force.
 
-    With it the standard errors are up to ``raised`` times what they are with
-    the estimate.
+    With it the standard errors are up to ``raised`` times those with the estimate.
     """
 
     declared_rad: float
@@ -95,43 +94,42 @@ class DeclaredErrorContradicted(Caution):
 
 @dataclass(frozen=True)
 class MagnitudeContradicts(Caution):
-    """Under the fit |a| is off by ``ratio`` times its noise, most in the
-    ``worst`` row."""
+    """Under the fit |a| is off by ``ratio`` times its noise, most in the ``worst``
+    row."""
 
     ratio: float
     worst: Row
 
 
-# Weighted least squares of ``u = P g + c`` over poses of known attitude, whose
-# errors are nuisances of the fit.
+# Weighted least squares of ``u = P g + c`` over poses of known attitude, with the
+# errors of the attitudes as nuisances.
 
 PARAMETERS = 12
-"""A matrix of nine and three offsets: the attitudes tell the rotation as well."""
+"""A matrix of nine and three offsets: attitudes determine the rotation as well."""
 ROUNDS_MOST = 60
-"""Steps of Gauss–Newton, which ends sooner where it converges."""
+"""Gauss–Newton steps; fewer where it converges."""
 CONVERGED = 1e-11
 """Relative change of the matrix from step to step: far below any noise, above
 rounding."""
 ALARM = 0.005
-"""Probability that one of a set of right rows is called wrong."""
+"""Probability of a false alarm in a set of right rows."""
 ESTIMATE_BELOW = 0.2
-"""Residuals of less probability are put down to the attitudes, where nobody
-declared their error."""
+"""Residuals of smaller probability are attributed to the attitudes, where their error
+was not declared."""
 ERROR_LEAST = 1e-8
-"""Attitudes that are off by less, in rad (2 milliarcseconds), count as exact."""
+"""Smaller errors of attitudes, in rad (2 milliarcseconds), count as zero."""
 ERROR_MOST = 0.3
-"""Attitudes that are off by more, in rad, carry nothing."""
+"""Largest useful error of attitudes, in rad."""
 PAIRS_MOST = 400
-"""Pairs of rows of which each is tried for the rotation: one of two right rows
-is enough. All pairs of 28 rows; of more rows some, always the same, for the
-sake of time."""
+"""Pairs of rows that are tried for the rotation: one pair of right rows is enough.
+All pairs of 28 rows; of more rows a fixed subset, to limit the time."""
 TIED = 0.02
-"""Rows that take out of the sum of squares within this share of each other
-cannot be distinguished."""
+"""Rows whose reductions in chi-square are within this share of each other are
+tied."""
 
 
 class AttitudesContradictReadings(Refused):
-    """In too many rows to tell which are right."""
+    """Too many rows contradict the readings to determine the right ones."""
 
     def __init__(self) -> None:
         super().__init__("attitudes and readings contradict each other; are the rows in the order of the poses?")
@@ -139,7 +137,7 @@ class AttitudesContradictReadings(Refused):
 
 @dataclass(frozen=True)
 class TurntableData:
-    """``u`` (n,3) outputs, ``covariance`` (n,3,3) of them with ``dof`` behind,
+    """``u`` (n,3) outputs, ``covariance`` (n,3,3) with ``dof`` degrees of freedom,
     ``ups`` (n,3) as stated."""
 
     u: Floats
@@ -154,12 +152,10 @@ class TurntableData:
 
 @dataclass(frozen=True)
 class TurntableSolution:
-    """``P`` (3,3) and ``c`` (3,) with ``covariance`` (12,12) of P row by row
-    and c; ``noise_only`` the same were the attitudes exact. ``rest`` (n,3)
-    residuals, ``weight`` (n,3,3) their inverse covariance, ``design`` (n,3,12).
-    ``found`` (n,3) the attitudes that the fit settled on, unit vectors;
-    ``target`` (n,3) what ``design @ p`` is fitted to.
-    """
+    """``P`` (3,3) and ``c`` (3,) with ``covariance`` (12,12) of P row by row and c;
+    ``noise_only`` the same for exact attitudes. ``rest`` (n,3) residuals, ``weight``
+    (n,3,3) their inverse covariance, ``design`` (n,3,12). ``found`` (n,3) the fitted
+    attitudes, unit vectors; ``target`` (n,3) the data of ``design @ p``."""
 
     data: TurntableData
     P: Floats
@@ -187,18 +183,18 @@ class TurntableSolution:
         return lack_of_fit_p(self.chi2, self.left, self.data.dof)
 
     def without(self, row: int) -> tuple[Floats, Floats]:
-        """P and c of all other poses."""
+        """P and c from all other poses."""
         rest: Ints = np.delete(np.arange(len(self.rest)), row)
         p, _ = _weighted(self.design[rest], self.weight[rest], self.target[rest])
         return p[:9].reshape(3, 3), p[9:]
 
     @property
     def error_uncertainty_rad(self) -> float:
-        """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is
+        """Standard error of the estimate ``error_rad``, which makes ``chi2`` equal to
         ``left``.
 
-        The sum has variance 2 ``left``, and the part of it that is the
-        attitudes' falls with the square of their error.
+        Chi-square has variance 2 ``left``, and the part due to the attitudes
+        decreases with the square of their error.
         """
         of_noise = np.einsum("nij,njk,nkl,nli->", self.weight, self.free, self.weight, self.data.covariance)
         of_attitudes = float(self.left - of_noise)
@@ -214,8 +210,9 @@ class TurntableSolution:
 
 
 def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
-    """With the declared error of the attitudes; else the smallest with which
-    the residuals are as large as expected."""
+    """The solution with the declared error of the attitudes; else with the smallest
+    error that explains the residuals."""
+    # With exact attitudes first; keep them if the residuals agree.
     solution = iterated(data, error_rad or 0.0)
     if error_rad is not None or solution.p is None or solution.p > ESTIMATE_BELOW:
         return solution
@@ -224,6 +221,7 @@ def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
         tried = iterated(data, float(np.exp(log)))
         return tried.chi2 - tried.left
 
+    # Bracket the error at which chi-square equals its degrees of freedom, then Brent.
     low = np.log(ERROR_LEAST)
     if excess(low) <= 0:
         return solution
@@ -237,29 +235,34 @@ def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
 
 
 def iterated(data: TurntableData, error_rad: float) -> TurntableSolution:
-    """With attitudes that err by so much: Gauss–Newton over the twelve
-    parameters, each attitude following within its error. Raises Refused where
-    it runs away."""
+    """The solution for attitudes with this error: Gauss–Newton over the twelve
+    parameters, with each attitude adjusted within its error. Raises Refused where it
+    diverges."""
     n = len(data.u)
     g = data.ups
     design = np.zeros((n, 3, PARAMETERS))
     P, c = _plain(data)
     for _ in range(ROUNDS_MOST):
+        # Design at the adjusted attitudes, row by row of P, and the offsets.
         for i in range(3):
             design[:, i, 3 * i : 3 * i + 3] = data.reference * g
             design[:, i, 9 + i] = 1.0
+        # Two angles of each attitude: their outputs, and the stated attitude in them.
         across = _across(g)
         turned = data.reference * P @ across  # (n,3,2): outputs by the two angles
         stated = np.einsum("nik,ni->nk", across, data.ups - g)  # the stated attitude, seen from the settled one
+        # Covariance with the attitudes' errors: V = Σ + σ² T Tᵀ.
         V = data.covariance + error_rad**2 * turned @ turned.transpose(0, 2, 1)
         try:
             weight = np.linalg.inv(V)
         except np.linalg.LinAlgError:
             raise AttitudesContradictReadings from None
         target = data.u - np.einsum("nik,nk->ni", turned, stated)
+        # Weighted step for P and c.
         p, covariance = _weighted(design, weight, target)
         P, before, c = p[:9].reshape(3, 3), P, p[9:]
         rest = target - design @ p
+        # Posterior mean of the attitudes' angles: σ² Tᵀ V⁻¹ r.
         if error_rad:
             tilt = stated + error_rad**2 * np.einsum("nik,nij,nj->nk", turned, weight, rest)
             g = g + np.einsum("nik,nk->ni", across, tilt)
@@ -271,15 +274,15 @@ def iterated(data: TurntableData, error_rad: float) -> TurntableSolution:
 
 
 def _plain(data: TurntableData) -> tuple[Floats, Floats]:
-    """P and c without weights, to begin with."""
+    """P and c by unweighted least squares, as a starting point."""
     design = np.concatenate([data.reference * data.ups, np.ones((len(data.u), 1))], axis=1)
     found = np.linalg.lstsq(design, data.u, rcond=None)[0]
     return found[:3].T, found[3]
 
 
 def _weighted(design: Floats, weight: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """Least squares with weights by pose: parameters (12,) and covariance
-    (12,12)."""
+    """Weighted least squares by pose: parameters (12,) and covariance (12,12)."""
+    # Whiten the rows by the Cholesky factors of their weights.
     root = np.linalg.cholesky(weight).transpose(0, 2, 1)
     X, y = (root @ design).reshape(-1, PARAMETERS), (root @ target[..., None]).ravel()
     norms = np.linalg.norm(X, axis=0)
@@ -288,7 +291,7 @@ def _weighted(design: Floats, weight: Floats, target: Floats) -> tuple[Floats, F
 
 
 def _across(g: Floats) -> Floats:
-    """(n,3,2): two unit vectors at right angles to each of ``g`` (n,3)."""
+    """(n,3,2): two unit vectors perpendicular to each of ``g`` (n,3)."""
     spare = np.eye(3)[np.argmin(np.abs(g), axis=1)]
     one = np.cross(g, spare)
     one /= np.linalg.norm(one, axis=1, keepdims=True)
@@ -296,9 +299,9 @@ def _across(g: Floats) -> Floats:
 
 
 def wrong_by_magnitude(poses: Sequence[Pose], ups: Floats, reference: float) -> Ints:
-    """Rows whose attitude does not go with those of most others, judged by the
-    angles that |a| alone says are between the poses. None where |a| cannot
-    say."""
+    """Rows whose attitude disagrees with most others, by the angles between the poses
+    that |a| alone determines. None where |a| does not determine them."""
+    # Directions in the sensor's frame from the fit to |a|; the handedness is unknown.
     try:
         problem = problem_of(poses, reference=reference)
         sensor = start(problem, poses, (1, 1, 1)).sensor(problem)
@@ -307,14 +310,16 @@ def wrong_by_magnitude(poses: Sequence[Pose], ups: Floats, reference: float) -> 
     a = sensor.specific_force(np.array([p.mean for p in poses]), {})
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     mirrored = a * [1.0, 1.0, -1.0]  # signs are not known, but only their product is no rotation
+    # The handedness with the smaller median deviation.
     off = min((_off_most(v, ups) for v in (a, mirrored)), key=lambda v: float(np.median(v)))
     scale = max(float(np.median(off)), 1e-9)
     return np.flatnonzero(off > np.clip(10 * scale, 0.02, ERROR_MOST))
 
 
 def _off_most(a: Floats, ups: Floats) -> Floats:
-    """(n,) angles between ``ups`` and ``a`` under the rotation that suits most
-    of them best."""
+    """(n,) angles between ``ups`` and ``a`` under the rotation that fits most of
+    them."""
+    # Rotations from pairs of rows that are far enough apart; the least median wins.
     i, j = np.tril_indices(len(a), -1)
     apart = np.minimum(*(np.linalg.norm(np.cross(v[i], v[j]), axis=1) for v in (a, ups))) > 0.3
     i, j = i[apart], j[apart]
@@ -327,33 +332,35 @@ def _off_most(a: Floats, ups: Floats) -> Floats:
 
 
 def wrong_by_residual(s: TurntableSolution) -> Ints:
-    """The row whose residual stands out from the noise and from all others, as
-    if it had not been in the fit.
+    """The row with a significant deletion residual, against the noise and all other
+    rows.
 
-    None where no row does, several where these cannot be distinguished.
+    Empty where there is none, several rows where these are tied.
     """
     n, left = len(s.data.u), s.left - 3
     if left < 3:
         return np.zeros(0, dtype=int)
+    # Reduction in chi-square by deletion of each row: rᵀ C⁺ r.
     taken = np.einsum("ni,nij,nj->n", s.rest, np.linalg.pinv(s.free, rcond=1e-9, hermitian=True), s.rest)
     most = float(np.max(taken))
     after = max(s.chi2 - most, 1e-300)
+    # F-tests against the noise and against the rest, with Bonferroni's factor.
     p = float(f_sf(most / 3, 3, max(s.data.dof, 1.0)))
     p = max(p, float(f_sf(most / 3 / (after / left), 3, left))) * n
     return np.flatnonzero(taken > (1 - TIED) * most) if p < ALARM else np.zeros(0, dtype=int)
 
 
-# From ``u = P g + c`` to a sensor and the rotation of its frame: K, R and C of ``P
-# = K R C``.
+# From ``u = P g + c`` to a sensor and the rotation of its frame: K, R and C of
+# ``P = K R C``.
 
 SECOND_ORDER = 0.2
-"""Share of a standard error from which on squares of the misalignments' errors
+"""Share of a standard error from which on the squares of the misalignments' errors
 are added to it."""
 
 
 def signs_of(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
-    """(3,) as declared, else those with which the sensor's frame lies nearest
-    to the table's."""
+    """(3,) signs as declared, else those with the sensor's frame nearest to the
+    table's."""
     product = float(np.sign(np.linalg.det(s.P)))
     if signs is not None:
         flips = np.asarray(signs, dtype=float)
@@ -368,8 +375,9 @@ def signs_of(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
 
 
 def sensor_and_rotation(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Floats]:
-    """The sensor, its frame such that R is upper triangular and K has the signs
-    ``flips``, and the rotation C."""
+    """The sensor, with R upper triangular and the signs ``flips`` of K, and the
+    rotation C."""
+    # RQ decomposition P = (K R) C, with signs moved between both factors.
     KR, C = scipy.linalg.rq(P)
     turn = flips * np.sign(np.diag(KR))
     KR, C = KR * turn, turn[:, None] * C
@@ -379,8 +387,8 @@ def sensor_and_rotation(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Fl
 
 
 def parameters_by_entries(s: TurntableSolution, flips: Floats, C: Floats) -> Floats:
-    """(12,12) derivative of scale factor, misalignment, bias and turns of the
-    sensor's frame by P row by row and c."""
+    """(12,12) derivative of scale factor, misalignment, bias and rotation of the
+    sensor's frame by P row by row and c, by central differences."""
 
     def of(p: Floats) -> Floats:
         sensor, turned = sensor_and_rotation(p[:9].reshape(3, 3), p[9:], flips)
@@ -395,11 +403,11 @@ def parameters_by_entries(s: TurntableSolution, flips: Floats, C: Floats) -> Flo
 
 
 def second_order(covariance: Floats, sensor: Sensor, reference: float) -> Floats:
-    """(12,) what angles that are known so poorly do to scale factors and biases
-    by their squares, where this counts.
+    """(12,) effect of the squares of poorly known angles on scale factors and biases,
+    where it counts.
 
-    On six faces only attitudes tell the misalignments; an axis that is off by
-    an angle reads its cosine.
+    On six faces only attitudes determine the misalignments; an axis that is off by an
+    angle reads its cosine.
     """
     square = float(np.max(np.diag(covariance)[3:6]))
     scale = np.abs(sensor.scale_factor) * square
@@ -409,27 +417,26 @@ def second_order(covariance: Floats, sensor: Sensor, reference: float) -> Floats
 
 
 DILUTION_MOST = 100.0
-"""Largest standard error of a combination of the twelve parameters, in errors
-of one pose: the limit that a fit to still poses has."""
+"""Largest standard error of a combination of the twelve parameters, in errors of one
+pose, as in a fit to still poses."""
 RAISED = 1.5
-"""By how much the error of the attitudes has to raise a standard error to be
-worth a word."""
+"""Factor by which the error of the attitudes has to raise a standard error to be
+reported."""
 FREE_LEAST = 1e-3
-"""Poses of which less of the error shows as a residual are not judged by it."""
+"""Poses that show a smaller share of their error as a residual are not tested by
+it."""
 LEFT_LEAST = 6
-"""Degrees of freedom below which the residual proves little: half a degree for
-each of the parameters."""
+"""Degrees of freedom below which the residual proves little: half a degree for each
+of the parameters."""
 WRONG_MOST = 0.25
-"""Share of the rows that may be wrong; with more it is not known which ones are
-right."""
+"""Largest share of wrong rows; with more, the right ones are not known."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """What one pose says of its attitude. ``up`` (3,) is the direction of the
-    specific force in the table's frame, a unit vector; ``off_rad`` the angle
-    between it and what the fit finds, ``off`` in that angle's standard
-    errors."""
+    """The attitude of one pose. ``up`` (3,) is the direction of the specific force in
+    the table's frame, a unit vector; ``off_rad`` the angle between it and the fit,
+    ``off`` the same in standard errors."""
 
     name: str
     up: Floats
@@ -439,15 +446,15 @@ class Attitude:
 
 @dataclass(frozen=True)
 class AttitudeFit:
-    """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad``
-    (3,) standard errors of turns of the sensor's frame about its axes.
+    """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad`` (3,)
+    standard errors of rotations of the sensor's frame about its axes.
     ``attitude_error_rad`` by axis and pose, declared or ``estimated`` from the
     residuals, then with its standard error, ``attitude_error_uncertainty_rad``.
-    ``noise_error`` (9,) are the standard errors that the same poses would give,
-    were the attitudes exact; ``attitudes`` are those of all poses.
+    ``noise_error`` (9,) are the standard errors for exact attitudes; ``attitudes``
+    are those of all poses.
 
-    ``if_estimated`` is the fit with an estimate, where the residuals contradict
-    the error that was declared and a larger one explains them.
+    ``if_estimated`` is the fit with an estimate, where the residuals contradict the
+    declared error and a larger one explains them.
     """
 
     calibration: Calibration
@@ -470,16 +477,16 @@ def fit_attitudes(
     reference: float = 1.0,
     attitude_error_rad: float | None = None,
 ) -> AttitudeFit:
-    """Fit the linear model to still poses whose attitudes are known.
+    """Fit the linear model to still poses of known attitude.
 
-    ``ups`` (n,3): the direction of the specific force at rest (up) in the
-    table's frame, of any length. ``names`` tell the rows in words. ``signs``
-    (3,) of the scale factors; attitudes show them but for a half turn of the
-    sensor's frame about one of its axes, and without them the frame nearest to
-    the table's is taken. ``attitude_error_rad``, standard error of either
-    angle, is estimated from the residuals where it is None. Raises Refused
-    where the poses cannot carry twelve parameters, or rows and poses contradict
-    each other; InvalidData.
+    ``ups`` (n,3): the direction of the specific force at rest (up) in the table's
+    frame, of any length. ``names`` of the rows. ``signs`` (3,) of the scale factors;
+    attitudes determine them up to a half turn of the sensor's frame about one of its
+    axes, and without them the frame nearest to the table's is used.
+    ``attitude_error_rad``, the standard error of either angle, is estimated from the
+    residuals where it is None. Raises Refused where the poses cannot carry twelve
+    parameters, or rows and poses contradict each other; InvalidData for bad
+    arguments.
     """
     ups = _checked(poses, ups, signs, reference, attitude_error_rad)
     called = list(names) if names is not None else [f"row {i + 1}" for i in range(len(poses))]
@@ -490,6 +497,7 @@ def fit_attitudes(
         reference,
         within_pose_dof(poses),
     )
+    # Exclude rows that contradict the angles between the poses.
     rows = np.arange(len(poses))
     wrong = wrong_by_magnitude(poses, ups, reference)
     if len(wrong) > WRONG_MOST * len(poses):
@@ -498,15 +506,17 @@ def fit_attitudes(
             f"{len(wrong)} of {len(poses)} attitudes contradict the angles between the poses, beginning with {given}; "
             "are the rows in the order of the poses?"
         )
+    # Exclude further rows one by one by their deletion residuals.
     while True:
         kept = np.setdiff1d(rows, wrong)
         _require_spread(data.ups[kept], signs)
-        # As if nobody knew of an error of all: it would be made to explain a
-        # single wrong row.
+        # Without an estimated error of the attitudes, which would absorb a single
+        # wrong row.
         worst = wrong_by_residual(iterated(data.only(kept), attitude_error_rad or 0.0))
         if len(worst) != 1 or len(wrong) + 1 > WRONG_MOST * len(poses):
             break
         wrong = np.sort(np.append(wrong, kept[worst]))
+    # Final solution; then the competing fit with an estimated error of the attitudes.
     found = _concluded(poses, data, solved(data.only(kept), attitude_error_rad), kept, called, signs)
     more: list[Caution] = []
     if len(worst) > 1:
@@ -522,11 +532,11 @@ def fit_attitudes(
 def _if_estimated(
     poses: Sequence[Pose], ups: Floats, names: Sequence[str], signs: Sequence[float] | None, reference: float
 ) -> AttitudeFit | None:
-    """The fit with an error of the attitudes that the residuals say; None where
-    they say none.
+    """The fit with an error of the attitudes estimated from the residuals; None where
+    they show none.
 
-    Nor where |a| disagrees with it: then more than the attitudes is wrong, and
-    the estimate would stand for all of it.
+    Also None where |a| contradicts it: then more than the attitudes is wrong, and the
+    estimate would absorb all of it.
     """
     try:
         found = fit_attitudes(poses, ups, names=names, signs=signs, reference=reference)
@@ -567,7 +577,8 @@ def _checked(
 
 
 def _require_spread(ups: Floats, signs: Sequence[float] | None) -> None:
-    """Twelve parameters by poses (n,3): (up, 1) has to span four dimensions."""
+    """Twelve parameters need poses (n,3) with (up, 1) spanning four dimensions;
+    raises Refused otherwise."""
     if not _dilution(ups) < DILUTION_MOST:
         flips = np.ones(3) if signs is None else np.asarray(signs, dtype=float)
         labels = tuple(dict.fromkeys(label for label, _ in most_wanted(ups * flips)))
@@ -644,7 +655,7 @@ def _results(
 def _judged(
     data: TurntableData, s: TurntableSolution, direction: Floats, C: Floats, names: Sequence[str]
 ) -> tuple[Attitude, ...]:
-    """Stated attitudes against those that the readings show under the fit."""
+    """Stated attitudes against those from the readings under the fit."""
     inverse = np.linalg.inv(s.P) / data.reference
     V = inverse @ data.covariance @ inverse.T
     out = []

@@ -1,14 +1,13 @@
-"""Biases anew, everything else kept: a calibration that is brought up to date by
-a few still poses of a later day.
+"""Bias update: new biases from a few still poses of a later day, everything else
+kept.
 
-From day to day mostly the bias changes. The parameters of today are those of
-the earlier calibration, off by its errors and by what changes from recording to
-recording; |a| in the poses is an observation of all of them. The biases become
-their mean given the poses, and the other parameters stay as they are, with
-their uncertainty: a Schmidt–Kalman update, in which they are "considered"
-(Schmidt 1966, in Advances in Control Systems 3; Jazwinski 1970, section 8.4).
-That bias is the best one beside kept scale factors: over the sphere errors of
-the two are orthogonal in |a|.
+From day to day mostly the bias changes. The present parameters are those of the
+earlier calibration, with its errors and with changes from recording to recording; |a|
+in the poses observes all of them. The biases become their mean given the poses; the
+other parameters stay, with their uncertainty: a Schmidt–Kalman update, in which they
+are "considered" (Schmidt 1966, in Advances in Control Systems 3; Jazwinski 1970,
+section 8.4). This bias is optimal for the kept scale factors: over the sphere, errors
+of both are orthogonal in |a|.
 """
 
 from __future__ import annotations
@@ -56,35 +55,32 @@ from triaxcal.uncertainty.next_recording import START_TO_START
 from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K
 
 SCALE_FACTOR_SHARE = 0.1
-"""By how much the scale factors change from recording to recording, relatively,
-of what the biases change by, in references: the eight sensors of MIMU4444 came
-back by 160 to 220 ppm where their biases did by 2 mg."""
+"""Relative change of the scale factors from recording to recording, as a share of
+that of the biases in references: the eight sensors of MIMU4444 repeated within 160 to
+220 ppm, and within 2 mg for the biases."""
 UNFIT = 1e-4
-"""Probability of poses as far from kept scale factors below which the update is
-refused. Smaller than `SIGNIFICANT`, at which errors are raised: a refusal costs
-a whole calibration."""
+"""Probability of the poses under the kept scale factors below which the update is
+refused. Smaller than `SIGNIFICANT`, at which errors are raised: a refusal costs a
+whole calibration."""
 UNLIKE = 0.05
-"""A bias that moved by such a share of the reference is another unit's, or the
-outputs are in another unit: 60 K away, the sensitivities of mass-market data
-sheets make 0.035."""
+"""Change of a bias, in references, that indicates another unit or another unit of the
+outputs: over 60 K, the sensitivities of mass-market data sheets give 0.035."""
 STEPS_MOST, CONVERGED = 50, 1e-13
-"""Of Gauss and Newton; relative to the reference. A few do."""
+"""Gauss–Newton steps, and their relative size at the end; a few suffice."""
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What is known of a unit from before the poses. ``covariance`` (9+p,9+p) is
-    of the parameters of ``calibration``; what is not a number there is not
-    known.
+    """Knowledge of a unit before the poses. ``covariance`` (9+p,9+p) is that of the
+    parameters of ``calibration``; NaN where not known.
 
-    In the unit of the reference: ``scatter_g`` is a standard deviation of |a|
-    that every pose of it had beside its noise, ``noise_g`` what stands for the
-    noise of a pose that does not know its own, ``start_to_start`` the standard
-    deviation of |a| from recording to recording, None where nobody said;
-    ``measured``, or assumed. ``residual_dof`` are the degrees of freedom of the
-    residuals that told the scatter, 0 where none did. ``temperatures_c`` are
-    the lowest and the highest temperature of its poses, None where they are not
-    known. The ``linear_only`` one is updated too.
+    In the unit of the reference: ``scatter_g`` is the standard deviation of |a| from
+    pose to pose in excess of the noise, ``noise_g`` replaces the noise of a pose that
+    does not know its own, ``start_to_start`` is the standard deviation of |a| from
+    recording to recording, None where not stated; ``measured``, or assumed.
+    ``residual_dof`` are the degrees of freedom of the scatter, 0 where it has none.
+    ``temperatures_c`` are the lowest and the highest temperature of its poses, None
+    where not known. ``linear_only`` is updated too.
     """
 
     calibration: Calibration
@@ -101,9 +97,8 @@ class Earlier:
 
 @dataclass(frozen=True)
 class BiasMoved(Caution):
-    """The biases moved by ``shift``, where ``expected`` is the standard
-    deviation by which they do, both of |a| over the sphere and in references
-    (probability ``p``)."""
+    """The biases changed by ``shift``, with an ``expected`` standard deviation, both
+    of |a| over the sphere and in references (probability ``p``)."""
 
     shift: float
     expected: float
@@ -111,11 +106,11 @@ class BiasMoved(Caution):
 
 
 def updated_biases(poses: Sequence[Pose], earlier: Earlier, *, first: int | None = None) -> Calibration:
-    """``earlier`` with three biases by still poses of a later recording: by the
-    ``first`` so many distinct ones, or by all.
+    """``earlier`` with three biases from still poses of a later recording: from the
+    ``first`` so many distinct ones, or from all.
 
-    Raises Refused where the poses cannot carry three biases, or do not fit what
-    is kept; InvalidData where a channel that the effects need is missing.
+    Raises Refused where the poses cannot carry three biases, or do not fit the kept
+    parameters; InvalidData where a channel that the effects need is missing.
     """
     require_known(earlier)
     sound = [p for p in poses if not p.fault]
@@ -139,8 +134,8 @@ def updated_biases(poses: Sequence[Pose], earlier: Earlier, *, first: int | None
 
 
 def require_known(earlier: Earlier) -> None:
-    """Raises Refused where a calibration does not say how well its parameters
-    are known."""
+    """Raises Refused where a calibration does not state the uncertainty of its
+    parameters."""
     if not np.isfinite(earlier.covariance).all():
         raise Refused("the calibration does not say how uncertain its parameters are, so that nothing can be kept")
 
@@ -165,8 +160,8 @@ def _covariates(poses: Sequence[Pose], c: Calibration) -> dict[str, Floats]:
 
 
 def _chosen(poses: Sequence[Pose], c: Calibration, first: int | None) -> list[Pose]:
-    """The poses that are to be used. Raises Refused where they do not determine
-    three biases."""
+    """The poses of the update. Raises Refused where they do not determine three
+    biases."""
     up = _up(poses, c)
     if not np.isfinite(up).all():
         raise Refused("the calibration and the readings of these poses give no finite magnitude")
@@ -187,10 +182,9 @@ def _chosen(poses: Sequence[Pose], c: Calibration, first: int | None) -> list[Po
 
 @dataclass(frozen=True)
 class _ByPosesAlone:
-    """The ``shift`` (3,) of the biases by generalised least squares, without
-    what is known of it before, and its covariance ``variance`` (3,3); what it
-    leaves of |a| in the poses, ``miss`` (n,), as a sum of squares ``chi2`` in
-    units of the errors that are known by ``dof`` degrees of freedom."""
+    """The ``shift`` (3,) of the biases by generalised least squares without a prior,
+    and its covariance ``variance`` (3,3); the residuals of |a| in the poses, ``miss``
+    (n,), with ``chi2`` in units of errors of ``dof`` degrees of freedom."""
 
     shift: Floats
     variance: Floats
@@ -200,29 +194,28 @@ class _ByPosesAlone:
 
 
 class _Update:
-    """The parameters p = (scale factors, angles, biases, effects) of today are
-    p₀ + d with d ~ N(0, C + Q): C of the earlier calibration, Q of what changes
-    from recording to recording. A pose observes 0 = |a|(p₀ + d) − g + e."""
+    """The present parameters p = (scale factors, angles, biases, effects) are p₀ + d
+    with d ~ N(0, C + Q): C of the earlier calibration, Q of the changes from
+    recording to recording. A pose observes 0 = |a|(p₀ + d) − g + e."""
 
     def __init__(self, poses: Sequence[Pose], earlier: Earlier) -> None:
         self.poses, self.earlier, self.c = poses, earlier, earlier.calibration
         self.u, self.covariates = np.array([p.mean for p in poses]), _covariates(poses, self.c)
         self.noise = self._noise()
-        # R: the noise of each pose along the measured vector, and what the
-        # residuals of the earlier calibration showed beside noise.
+        # R: noise of each pose along the measured vector, and pose-to-pose scatter.
         self.variance = self.noise**2 + earlier.scatter_g**2
         self.pure_dof = within_pose_dof(poses)
         stated = earlier.start_to_start
         self.start_to_start = START_TO_START * self.c.reference if stated is None else stated
         self.expected, relative = self._changes()
         self.alone = self._by_poses_alone(relative)
-        # How far the biases went tells too: a unit that moved by more than was
-        # expected is not pulled back by the expectation.
+        # The observed shift enters too: a unit that moved further than expected is not
+        # pulled back by the expectation.
         went = self.alone.shift @ self.alone.shift - np.trace(self.alone.variance)
         self.since = self._since(max(self.expected, float(np.sqrt(max(went, 0.0) / 3))), relative)
 
     def _noise(self) -> Floats:
-        """(n,) standard errors of |a|."""
+        """(n,) standard errors of |a| by the noise of the poses."""
         covariance = np.array([p.covariance for p in self.poses])
         _, by_u = self.c.sensor.magnitude(self.u, self.covariates)
         unknown = np.array([p.dof <= 0 for p in self.poses])
@@ -242,11 +235,11 @@ class _Update:
         return replace(self.c.sensor, bias=bias).radius_by_parameters(self.u, self.covariates)
 
     def _changes(self) -> tuple[float, float]:
-        """By how much biases, and scale factors relatively, change from one
-        recording to another.
+        """Standard deviations of the changes of the biases, and of the relative
+        changes of the scale factors, from one recording to another.
 
-        A calibration without thermal effects holds at the temperatures of its
-        poses: beyond them all changes by what a kelvin usually makes.
+        A calibration without thermal effects holds at the temperatures of its poses:
+        beyond them typical sensitivities per kelvin are added.
         """
         g, kelvin = self.c.reference, self._kelvin_away()
         bias = np.hypot(self.start_to_start, SENSITIVITY_PER_K["temperature_bias"] * kelvin * g)
@@ -254,8 +247,8 @@ class _Update:
         return float(bias), float(np.hypot(relative, SENSITIVITY_PER_K["temperature_scale_factor"] * kelvin))
 
     def _kelvin_away(self) -> float:
-        """How far the poses are from the temperatures of the earlier ones, in
-        the mean; 0 where thermal effects are modelled, or nothing is logged."""
+        """Mean distance of the poses from the earlier temperatures; 0 where thermal
+        effects are modelled, or nothing is logged."""
         then = self.earlier.temperatures_c
         now = np.array([p.channels.get(TEMPERATURE, np.nan) for p in self.poses])
         modelled = any(TEMPERATURE in effect.needs for effect, _ in self.c.sensor.effects)
@@ -270,10 +263,11 @@ class _Update:
 
     def _by_poses_alone(self, relative: float) -> _ByPosesAlone:
         begin = bias = self.c.sensor.bias
-        # |a| is off by what is kept too, but for the biases.
+        # Errors of the kept parameters correlate the residuals of the poses.
         kept = self.earlier.covariance + self._since(0.0, relative)
         J = np.where(_is_bias(len(kept)), 0.0, self._jacobian(begin))
         inverse = np.linalg.inv(np.diag(self.variance) + J @ kept @ J.T)
+        # Gauss–Newton for the biases, by generalised least squares.
         for _ in range(STEPS_MOST):
             J = self._jacobian(bias)[:, 6:9]
             variance = np.linalg.inv(J.T @ inverse @ J)
@@ -281,16 +275,16 @@ class _Update:
             bias = bias + step
             if np.max(np.abs(step)) <= CONVERGED * self.c.reference:
                 break
-        # Noise is estimated by the poses themselves, scatter by the residuals of
-        # the earlier calibration, which may have been small by chance.
+        # Degrees of freedom: the noise comes from these poses, the scatter from the
+        # residuals of the earlier calibration.
         left, miss = self.earlier.residual_dof, self._miss(bias)
         dof = 1 / (1 / (self.pure_dof if self.pure_dof >= 1 else DOF_MOST) + (1 / left if left > 0 else 0.0))
         return _ByPosesAlone(bias - begin, variance, miss, float(miss @ inverse @ miss), dof)
 
     def _fits(self) -> tuple[float | None, float]:
-        """The probability of what the poses leave beside three biases, and by
-        what that raises the errors of the poses. Raises Refused where it is too
-        small for what is kept."""
+        """Probability of the residuals after three biases, and the factor by which
+        they raise the errors of the poses. Raises Refused where it is too small for
+        the kept parameters."""
         off = max(float(np.max(np.abs(self.alone.shift))), rms(self.alone.miss)) / self.c.reference
         if not off < UNLIKE:
             raise Refused(
@@ -311,9 +305,10 @@ class _Update:
         return p, max(ratio, 1.0)
 
     def _estimated(self, prior: Floats) -> tuple[Floats, Floats, Floats]:
-        """The biases (3,) given the poses, |a| by the parameters there
-        (n,9+p), and the gain (9+p,n), in which kept parameters have zeros."""
+        """The biases (3,) given the poses, derivatives of |a| by the parameters there
+        (n,9+p), and the gain (9+p,n), zero for kept parameters."""
         begin = bias = self.c.sensor.bias
+        # Iterated Kalman update: K = (C + Q) Jᵀ (J (C + Q) Jᵀ + R)⁻¹.
         for _ in range(STEPS_MOST):
             J = self._jacobian(bias)
             gain = prior @ J.T @ np.linalg.inv(J @ prior @ J.T + np.diag(self.variance))
@@ -321,11 +316,12 @@ class _Update:
             step, bias = moved - bias, moved
             if np.max(np.abs(step)) <= CONVERGED * self.c.reference:
                 break
+        # Schmidt: only the biases are updated.
         return bias, J, np.where(_is_bias(len(gain))[:, None], gain, 0.0)
 
     def _covariances(self, J: Floats, gain: Floats, raised: float) -> dict[str, Floats]:
-        """Of the errors of all parameters, by their source: Joseph's form,
-        which holds for any gain."""
+        """Covariances of all parameters by source, in Joseph's form, which holds for
+        any gain."""
         rest = np.eye(len(gain)) - gain @ J
         found = {
             "noise": (gain * self.noise**2) @ gain.T,
@@ -337,7 +333,8 @@ class _Update:
         return {name: v for name, v in found.items() if np.any(v)}
 
     def calibration(self, all_poses: Sequence[Pose]) -> Calibration:
-        """Of all that were given, those with a fault are told."""
+        """The updated calibration, with a caution for the faulty ones of all given
+        poses."""
         p, raised = self._fits()
         bias, J, gain = self._estimated(self.earlier.covariance + self.since)
         covariances = self._covariances(J, gain, raised)
@@ -400,8 +397,8 @@ class _Update:
             yield BiasMoved(float(np.linalg.norm(shift)) / np.sqrt(3) / g, self.expected / g, p)
 
     def _holds_at(self) -> ReferenceEpoch | None:
-        """Effects of time are those of the earlier recording, at its moment;
-        without them the biases are the mean over the poses."""
+        """Effects of time keep the earlier epoch; without them the biases are the
+        mean over the poses."""
         timed = any({TIME, SINCE_START} & set(effect.needs) for effect, _ in self.c.sensor.effects)
         return self.c.holds_at if timed else ReferenceEpoch.of(self.poses, Moment.MEAN)
 

@@ -1,11 +1,10 @@
-"""Refinement of datasheet values: a calibration that is known from before,
-brought up to date by a few still poses.
+"""Refinement of datasheet values by a few still poses.
 
-The paper's reference 3 adds increments to datasheet values until |a| is right
-in the poses. Here the datasheet's values are observations with standard errors
-of their own beside the poses (JCGM 102; Bayes with normal priors): fewer poses
-than parameters will do, each parameter is moved as far as the poses know better
-than the datasheet, and whether the two contradict each other can be tested.
+The paper's reference 3 adds increments to datasheet values until |a| is right in the
+poses. Here the datasheet's values are observations with standard errors of their own
+(JCGM 102; Bayes with normal priors): fewer poses than parameters suffice, each
+parameter moves as far as the poses are more informative than the datasheet, and a
+contradiction between both can be tested.
 """
 
 from __future__ import annotations
@@ -34,23 +33,20 @@ from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
 from triaxcal.poses.pose import Pose
 
 STEPS_MOST = 60
-"""Bounds the search, which ends sooner where it converges and refuses where it
-does not."""
+"""Largest number of steps; a search that has not converged then is refused."""
 CONVERGED = 1e-12
-"""Relative step of the search at which rounding is all that is left."""
+"""Relative step at the end of the search, within rounding."""
 CONFLICT = 0.01
 """Probability below which poses contradict the datasheet: one sound unit in a
 hundred is called so. A higher level would blame more; a lower one let more
 changed units pass."""
 NAMED = 0.95
-"""Probability with which the value that has changed is among those named: the
-level of coverage."""
+"""Probability with which the changed value is among those named."""
 SHARE_LEAST = 1e-6
-"""Share of the information on a parameter below which rounding is all that the
-poses say."""
+"""Share of the information on a parameter that is within rounding."""
 FROM_POSES, FROM_DATASHEET = 0.9, 0.1
-"""Share of the information on a parameter from which on it counts as the
-poses', or still as the datasheet's."""
+"""Shares of the information on a parameter from which on its source is the poses, or
+the datasheet."""
 
 
 class FarFromPoses(Refused):
@@ -62,10 +58,10 @@ class FarFromPoses(Refused):
 
 @dataclass(frozen=True)
 class Datasheet:
-    """Values known from before. ``standard_error`` (9+p,) in the order of
+    """Prior values. ``standard_error`` (9+p,) in the order of
     `Calibration.parameters`: scale factors, misalignments, biases, effects'
-    coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their
-    errors, none where it is None."""
+    coefficients; zero fixes a value. ``correlation`` (9+p,9+p) of their errors, none
+    where it is None."""
 
     sensor: Sensor
     standard_error: Floats
@@ -96,8 +92,7 @@ class Datasheet:
 
     @property
     def root(self) -> Floats:
-        """(9+p,q): what independent errors of variance one make of the values
-        that are free; its square is their covariance."""
+        """(9+p,q) square root of the covariance of the free values."""
         error = self.standard_error
         free = np.flatnonzero(error > 0)
         if self.correlation is None:
@@ -110,11 +105,10 @@ class Datasheet:
 
 @dataclass(frozen=True)
 class DatasheetContradicted(Caution):
-    """Poses and datasheet values contradict each other (probability ``p``). A
-    change of any one of ``parameters``, the likeliest first, would explain most
-    of it; they moved by ``shifts`` standard errors. ``alone``: whether the
-    change of one explains all of it; standard errors are ``raised`` so many
-    times."""
+    """Poses and datasheet values contradict each other (probability ``p``). A change
+    of one of ``parameters``, the likeliest first, would explain most of it; they
+    moved by ``shifts`` standard errors. ``alone``: the change of one explains all of
+    it; standard errors are ``raised`` so many times."""
 
     p: float
     parameters: tuple[str, ...]
@@ -125,7 +119,7 @@ class DatasheetContradicted(Caution):
 
 @dataclass(frozen=True)
 class StillOfDatasheet(Caution):
-    """The poses say next to nothing of these ``parameters``."""
+    """The poses have hardly any information on these ``parameters``."""
 
     parameters: tuple[str, ...]
 
@@ -169,11 +163,13 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
     problem = _problem(poses, datasheet)
     free = datasheet.standard_error > 0
     root = datasheet.root
+    # Maximum a posteriori: p = p₀ + L z with z ~ N(0, 1), C = L Lᵀ.
     z, information = _solved(problem, datasheet, root)
     p = datasheet.values + root @ z
     prior = datasheet.standard_error**2
     covariance = root @ np.linalg.inv(information) @ root.T
     state = _state(problem, datasheet, p)
+    # Residuals and Jacobian there; chi-square of poses and prior together.
     r, J, s = linearise(problem, state)
     J = J @ _theta_by_parameters(problem, state)
     moved = p - datasheet.values
@@ -182,6 +178,7 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
     conflict_p = lack_of_fit_p(chi2, len(poses), pure if pure >= 1 else 1e6)
     raised = max(1.0, float(np.sqrt(chi2 / len(poses)))) if conflict_p is not None and conflict_p < CONFLICT else 1.0
     leverage = np.clip(np.einsum("ni,ij,nj->n", J, covariance, J) / s**2, 0.0, 1.0)
+    # Share of the information, and shifts in their standard errors by chance.
     share = np.where(free, 1 - np.diag(covariance) / np.where(free, prior, 1.0), 0.0)
     by_chance = np.sqrt(np.maximum(prior * share, 0.0))
     shift = np.where(share > SHARE_LEAST, moved / np.where(share > SHARE_LEAST, by_chance, 1.0), 0.0)
@@ -199,6 +196,7 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
         holds_at=datasheet.holds_at,
     )
     found = Refinement(calibration, datasheet, share, shift, conflict_p)
+    # In a conflict, find the parameters whose change would explain it.
     if raised > 1:
         changed = _changed(datasheet, root, z, information)
         without = chi2 - next(iter(changed.values()), 0.0) ** 2
@@ -211,12 +209,11 @@ def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats)
     """`Refinement.changed`: the parameters one of which has changed with the
     probability `NAMED`.
 
-    A change of unknown size in one value is ``effect / variance`` ±
-    ``1/√variance``, and takes ``effect²/variance`` off the sum of squares.
-    Changes are taken to be as many times the datasheet's standard error as a
-    Cauchy variable is: they may be of any size, and of two that explain the
-    same, the smaller is the likelier. A single pose could be explained by any
-    value, by most of them with a change a thousand times as large.
+    A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``
+    and lowers chi-square by ``effect²/variance``. The prior of its size in the
+    datasheet's standard errors is a Cauchy distribution: any size is possible, and of
+    two equal explanations the smaller is likelier. A single pose could be explained
+    by any value, by most of them with a change a thousand times as large.
     """
     free = np.flatnonzero(datasheet.standard_error > 0)
     back = np.linalg.pinv(root[free])
@@ -237,8 +234,8 @@ def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats)
 
 
 def _problem(poses: Sequence[Pose], datasheet: Datasheet) -> Problem:
-    """Scaled by what the datasheet expects, since few poses have no range of
-    their own."""
+    """The problem, scaled to the range that the datasheet predicts, since few poses
+    have no range of their own."""
     sensor = datasheet.sensor
     held = covariates_elsewhere(poses, datasheet.channel_reference, sensor.scale_factor, sensor.bias, datasheet.moment)
     return Problem(
@@ -264,8 +261,8 @@ def _theta_by_parameters(problem: Problem, state: State) -> Floats:
 
 
 def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Floats, Floats]:
-    """Shifts (q,) of the values along ``root`` (9+p,q) and the information
-    (q,q) on them: Gauss–Newton with halved steps."""
+    """Shifts z (q,) of the values along ``root`` (9+p,q), and the information (q,q)
+    on them: Gauss–Newton with step halving."""
     z = np.zeros(root.shape[1])
     free = datasheet.standard_error > 0
     size = max(float(np.linalg.norm(datasheet.values[free] / datasheet.standard_error[free])), 1.0)
@@ -283,11 +280,13 @@ def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Float
         if not (np.isfinite(J).all() and np.isfinite(r).all() and np.all(s > 0)):
             raise FarFromPoses
         J = J @ _theta_by_parameters(problem, state) @ root / s[:, None]
+        # Normal equations with the unit prior of z.
         information = J.T @ J + np.eye(len(z))
         if not np.isfinite(information).all():
             raise FarFromPoses
         step = -np.linalg.solve(information, J.T @ (r / s) + z)
         now, scale = cost(z, s), 1.0  # the weights follow the gradient from step to step
+        # Halve the step until the posterior does not decrease.
         for _ in range(20):
             trial = z + scale * step
             if cost(trial, s) <= now * (1 + 1e-9) + 1e-12:
@@ -320,7 +319,7 @@ def _condition(information: Floats) -> float:
 
 
 def _dilution(problem: Problem, state: State) -> float:
-    """Of the poses alone, without the datasheet."""
+    """Dilution of the poses alone, without the datasheet."""
     up = state.sensor(problem).up(problem.u, problem.covariates)
     return dilution(up, linear_design(up, (problem.u - problem.middle) / problem.half))
 

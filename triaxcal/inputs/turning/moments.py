@@ -1,11 +1,10 @@
-"""What is kept of the raw samples of a turning unit: sums up to the fourth
-degree, in one pass and constant memory.
+"""Moments of the raw samples of a turning unit up to the fourth degree, in one pass
+and constant memory.
 
 The stream is cut into stretches of equal length; whenever their number reaches
-`STRETCHES_MOST` neighbours are put together. Where stretches begin and end
-depends on the samples alone, not on the blocks they came in. What differs
-between stretches by more than noise tells later how far the samples may be
-trusted.
+`STRETCHES_MOST`, neighbours are merged. The limits of the stretches depend on the
+samples alone, not on the size of the blocks. Differences between stretches in excess
+of the noise later show how far the samples may be trusted.
 """
 
 from __future__ import annotations
@@ -19,35 +18,34 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.errors import InvalidData
 
 MONOMIALS = [e for e in itertools.product(range(3), repeat=3) if sum(e) <= 2]
-"""Exponents of the ten monomials of a quadric; products of two of them give all
-up to the fourth degree."""
+"""Exponents of the ten monomials of a quadric; products of two of them are all
+monomials up to the fourth degree."""
 STRETCHES_MOST = 128
-"""Bounds the memory. Once they are put together in pairs half of them are left,
-twice as many as a judgement of their scatter needs. Even, so that pairs come
-out."""
+"""Bound of the memory. After merging, half of them remain, twice as many as the
+assessment of their scatter needs. Even, so that pairs come out."""
 STRETCH_LEAST = 16
-"""Samples in a stretch to begin with: as many as are kept of one (`SAMPLED`)."""
+"""Initial number of samples in a stretch: as many as are kept of one (`SAMPLED`)."""
 SAMPLED = 16
-"""Samples that are kept of every stretch, to know the directions."""
+"""Samples kept of every stretch, for the directions."""
 DIFFERENCE = 4
-"""Order of the differences from sample to sample: they see the noise, and of a
-smooth motion next to nothing."""
+"""Order of the differences from sample to sample: they show the noise and hardly any
+smooth motion."""
 _DIFFERENCE_GAIN = 70.0
-"""What it does to the variance of white noise: the sum of the squares of 1, 4,
-6, 4, 1."""
+"""Gain of the differences for the variance of white noise: the sum of the squares of
+1, 4, 6, 4, 1."""
 _PIECE = 1 << 13
-"""Samples of which products are formed at once, which bounds the memory. A
-power of two, as a stretch's length is one: either holds the other a whole
-number of times."""
+"""Number of samples whose products are formed at once, which bounds the memory. Both
+it and the length of a stretch are powers of two, so one is a multiple of the
+other."""
 _SPAN_LIMIT = 1e60
-"""Outputs whose range, or its inverse, is larger would not survive the fourth
-power."""
+"""Largest range of the outputs, and its inverse, of which the fourth power is
+finite."""
 
 
 @dataclass
 class Moments:
-    """Sums of products of monomials of the samples, by stretch. ``feed`` blocks
-    of any size, then `summary`."""
+    """Sums of products of monomials of the samples, by stretch. ``feed`` blocks of
+    any size, then `summary`."""
 
     count: int = 0
     _origin: Floats = field(default_factory=lambda: np.zeros(3))
@@ -63,8 +61,8 @@ class Moments:
     _rest: Floats = field(default_factory=lambda: np.zeros((0, 4)))
 
     def feed(self, u: Floats, temp_c: Floats | None = None) -> None:
-        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN
-        where it is not known.
+        """``u`` (n,3) raw outputs, ``temp_c`` (n,) their temperature, None or NaN
+        where unknown.
 
         Raises InvalidData where an output is not a finite number.
         """
@@ -75,8 +73,10 @@ class Moments:
         self.count += len(u)
         warm = np.full(len(u), np.nan) if temp_c is None else temp_c
         waiting = np.concatenate([self._rest, np.column_stack([u, warm])])
+        # Sums are taken about the first samples, so that an offset costs no digits.
         if not self._pieces and len(waiting) >= STRETCH_LEAST:
             self._origin = np.median(waiting[:STRETCH_LEAST, :3], axis=0)  # so that no digits are lost to an offset
+        # Take whole pieces, up to the next merging of stretches.
         at = 0
         while len(waiting) - at >= (piece := min(self._size, _PIECE)):
             until_full = STRETCHES_MOST * self._size // piece - self._pieces
@@ -88,6 +88,7 @@ class Moments:
     @np.errstate(over="ignore", invalid="ignore", under="ignore")  # judged by the range, in `summary`
     def _take(self, pieces: Floats) -> None:
         number, piece, _ = pieces.shape
+        # The stretch of every piece; add the sums of the pieces to it.
         into = (self._pieces + np.arange(number)) * piece // self._size
         sums, rough = _sums_of(pieces[..., :3] - self._origin)
         np.minimum.at(self._low, into, pieces.min(axis=1))
@@ -104,6 +105,8 @@ class Moments:
             self._halve()
 
     def _halve(self) -> None:
+        # Merge neighbouring stretches: add sums, combine ranges, keep every second
+        # sample.
         half = STRETCHES_MOST // 2
         for held in (self._sums, self._rough, self._lags, self._warmth):
             held[:half] = held[::2] + held[1::2]
@@ -115,8 +118,9 @@ class Moments:
         self._pieces = half * self._size // min(self._size, _PIECE)
 
     def summary(self) -> Summary:
-        """Of all samples so far. Raises InvalidData where an axis never moved,
-        or beyond what numbers can hold."""
+        """The summary of all samples so far. Raises InvalidData where an axis never
+        changed, or where values overflow."""
+        # Stretches begun so far, the last one with its own number of samples.
         piece = min(self._size, _PIECE)
         closed = -(-self._pieces * piece // self._size)
         counts = np.full(closed, self._size)
@@ -135,9 +139,8 @@ class Moments:
 
 @dataclass(frozen=True)
 class _Stretches:
-    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in
-    `Moments`. ``low`` and ``high`` (m,4) have the temperature too, and
-    ``warmth`` (m,) its sum."""
+    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`.
+    ``low`` and ``high`` (m,4) include the temperature, ``warmth`` (m,) is its sum."""
 
     origin: Floats
     counts: Ints
@@ -150,7 +153,8 @@ class _Stretches:
     warmth: Floats
 
     def and_then(self, rest: Floats) -> _Stretches:
-        """With samples and temperatures (n,4) that did not fill a stretch."""
+        """The same with further samples and temperatures (n,4) that did not fill a
+        stretch."""
         sums, rough = _sums_of(rest[None, :, :3] - self.origin)
         return replace(
             self,
@@ -169,6 +173,7 @@ class _Stretches:
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def summary(self) -> Summary:
+        # Range of every axis; scale the samples to −1 … 1.
         low, high = self.low[:, :3].min(axis=0), self.high[:, :3].max(axis=0)
         flat = [axis for axis, least, most in zip("xyz", low, high, strict=True) if not most > least]
         if flat:
@@ -176,6 +181,7 @@ class _Stretches:
         half, middle = (high - low) / 2, (high + low) / 2
         if not (np.all(half < _SPAN_LIMIT) and np.all(half > 1 / _SPAN_LIMIT)):
             raise InvalidData(f"outputs that range over {half.max():.3g} cannot be summed up")
+        # Transform the moments to the scaled monomials: T M Tᵀ.
         T = _change_of_basis(middle - self.origin, half)
         return Summary(
             middle=middle,
@@ -196,7 +202,7 @@ class _Stretches:
 
 @dataclass(frozen=True)
 class Temperature:
-    """Of the samples, °C."""
+    """Temperature of the samples in °C."""
 
     mean: float
     lowest: float
@@ -205,14 +211,13 @@ class Temperature:
 
 @dataclass(frozen=True)
 class Summary:
-    """Samples scaled to ``x = (u − middle)/half``, which lies between −1 and 1
-    in every axis.
+    """Samples scaled to ``x = (u − middle)/half``, between −1 and 1 in every axis.
 
-    ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products
-    of `MONOMIALS` in it; ``quick`` (3,) variance of the noise of one sample, in
-    scaled units, as far as differences from sample to sample show it;
-    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None
-    where it is not known of all samples.
+    ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products of
+    `MONOMIALS` in it; ``quick`` (3,) variance of the noise of one sample, in scaled
+    units, from differences from sample to sample; ``sampled`` (k,3) some of the
+    outputs, from everywhere; ``temperature`` None where it is not known of all
+    samples.
     """
 
     middle: Floats
@@ -230,23 +235,24 @@ class Summary:
 
     @property
     def reach(self) -> Floats:
-        """(m,3) how far the outputs of each stretch go from the median, at
-        most."""
+        """(m,3) largest deviation of the outputs of each stretch from the median."""
         middle = np.median(self.sampled, axis=0)
         return np.maximum(np.abs(self._fed.low[:, :3] - middle), np.abs(self._fed.high[:, :3] - middle))
 
     def only(self, stretches: Bools) -> Summary:
-        """Of some of the stretches, scaled anew."""
+        """The summary of some of the stretches, scaled anew."""
         return self._fed.only(stretches).summary()
 
     def mean(self) -> Floats:
-        """(10,10) over all samples."""
+        """(10,10) mean moments over all samples."""
         return np.asarray(np.einsum("m,mij->ij", self.counts / self.count, self.moments))
 
 
 def _sums_of(x: Floats) -> tuple[Floats, Floats]:
-    """Of pieces (m,n,3): sums of products of the monomials (m,10,10), and of
-    squared differences (m,3)."""
+    """Sums over pieces (m,n,3): products of the monomials (m,10,10), and squared
+    differences (m,3)."""
+    # Monomials 1, xᵢ and xᵢ xⱼ of every sample; then all their products as one matrix
+    # product.
     columns = np.ascontiguousarray(x.transpose(0, 2, 1))
     terms = np.empty((len(x), 10, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # judged by the range, in `summary`
@@ -264,6 +270,7 @@ def _sums_of(x: Floats) -> tuple[Floats, Floats]:
 def _change_of_basis(offset: Floats, half: Floats) -> Floats:
     """(10,10): the monomials of ``(x − offset)/half`` from those of x."""
     T = np.zeros((10, 10))
+    # Expand ((x − o)/h)^p by the binomial theorem, axis by axis.
     for row, powers in enumerate(MONOMIALS):
         for taken in itertools.product(*(range(p + 1) for p in powers)):
             factor = 1.0

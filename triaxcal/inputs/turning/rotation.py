@@ -1,18 +1,17 @@
-"""Calibration from a unit that turns slowly and never rests: adjusted least
-squares from streaming moments.
+"""Calibration of a unit that turns slowly and never rests: adjusted least squares
+from streaming moments.
 
-Ordinary fits of an ellipsoid to raw samples are biased by the square of the
-noise, which more samples do not cure. Adjusted least squares
-(`triaxcal.inputs.turning.rotation`) corrects the moments of the samples for the
-noise instead, and estimates it. All it needs of the samples are their moments
-up to the fourth degree (`triaxcal.inputs.turning.moments`).
+Ordinary ellipsoid fits to raw samples have a bias of the order of the squared noise,
+which more samples do not reduce. Adjusted least squares (Markovsky, Kukush and Van
+Huffel 2004) corrects the moments of the samples for the noise, and estimates it. It
+needs only the moments up to the fourth degree (`triaxcal.inputs.turning.moments`).
 
-How the noise is shared between the axes the ellipsoid does not show;
-differences from sample to sample do, where the unit turns slowly. Whether noise
-is all there is, is judged by stretches of the recording: the mean magnitude of
-each differs from the reference by no more than the noise of one sample over the
-root of their number, if the noise is white, the model complete, and gravity
-alone was felt."""
+The ellipsoid does not show how the axes share the noise; differences from sample to
+sample do, where the unit turns slowly. Stretches of the recording show whether there
+is more than noise: the mean magnitude of each differs from the reference by the noise
+of one sample over the root of their number, if the noise is white, the model
+complete, and the unit feels gravity alone.
+"""
 
 from __future__ import annotations
 
@@ -33,15 +32,15 @@ from triaxcal.model.directions import linear_design, most_wanted
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 
-# Adjusted least squares for an ellipsoid: moments corrected for noise, and the
-# noise at which they fit one exactly.
+# Adjusted least squares for an ellipsoid: moments corrected for the noise that makes
+# them exactly singular.
 
 ARITHMETIC = 1e-15
-"""Variance that the arithmetic leaves uncertain."""
+"""Rounding error of a variance."""
 
 
 class NoEllipsoid(Refused):
-    """The samples lie on none."""
+    """The samples lie on no ellipsoid."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -51,8 +50,8 @@ class NoEllipsoid(Refused):
 
 
 class DirectionsLacking(Refused):
-    """They cannot carry nine parameters; ``dilution`` by how much, where that
-    is known, and its limit."""
+    """The directions cannot carry nine parameters; ``dilution`` and its limit, where
+    known."""
 
     def __init__(self, dilution: tuple[float, float] | None = None) -> None:
         by = "" if dilution is None else " (dilution {:.3g}, limit {:g})".format(*dilution)
@@ -72,8 +71,8 @@ class Ellipsoid:
     variance: Floats
 
     def coefficients(self, held: Summary, reference: float) -> tuple[Floats, Floats, Floats]:
-        """Scale factor, misalignment and bias in the units of output and
-        reference, all signs plus."""
+        """Scale factor, misalignment and bias in the units of output and reference,
+        all signs plus."""
         return coefficients_of(self.T, self.o, held, reference)
 
 
@@ -81,14 +80,14 @@ def coefficients_of(T: Floats, o: Floats, held: Summary, reference: float) -> tu
     return coefficients(T / held.half * reference, held.middle + held.half * np.linalg.solve(T, o))
 
 
-# Hermite polynomials undo what Gaussian noise of variance v does to a power:
+# Hermite polynomials remove the effect of Gaussian noise of variance v on a power:
 # coefficients of x^(n-2m) v^m.
 _UNDO = {0: (1.0,), 1: (1.0,), 2: (1.0, -1.0), 3: (1.0, -3.0), 4: (1.0, -6.0, 3.0)}
 
 
 def _undoing() -> list[tuple[tuple[int, int], tuple[int, int], tuple[int, ...], float]]:
-    """Terms of the correction: entry corrected, entry that holds the lower
-    moment, powers of the variances, factor."""
+    """Terms of the correction: corrected entry, entry with the lower moment, powers
+    of the variances, factor."""
     at: dict[tuple[int, ...], tuple[int, int]] = {}
     for (i, left), (j, right) in itertools.product(enumerate(MONOMIALS), repeat=2):
         at.setdefault(tuple(p + q for p, q in zip(left, right, strict=True)), (i, j))
@@ -109,7 +108,7 @@ _FACTOR = np.array([t[3] for t in _TERMS])  # products of the coefficients of `_
 
 
 def corrected(moments: Floats, variance: Floats) -> Floats:
-    """Moments (…,10,10) of the noiseless samples, for noise of ``variance``
+    """Moments (…,10,10) of the noiseless samples, for Gaussian noise of ``variance``
     (3,)."""
     terms = _FACTOR * np.prod(variance**_POWERS, axis=1) * moments[..., _FROM[0], _FROM[1]]
     out = np.zeros(moments.shape)
@@ -118,8 +117,8 @@ def corrected(moments: Floats, variance: Floats) -> Floats:
 
 
 def fitted(held: Summary, shape: Floats) -> Ellipsoid:
-    """The ellipsoid for noise whose variances are as ``shape`` (3,); how large,
-    follows.
+    """The ellipsoid for noise with variances in the ratio of ``shape`` (3,); their
+    size follows.
 
     Raises Refused where there is none.
     """
@@ -128,9 +127,9 @@ def fitted(held: Summary, shape: Floats) -> Ellipsoid:
 
 
 def noise(mean: Floats, shape: Floats) -> float:
-    """The noise at which the corrected moments first become singular, as a
-    multiple of ``shape`` (3,); 0 where the arithmetic cannot tell it from
-    none."""
+    """The smallest noise with singular corrected moments, as a multiple of ``shape``
+    (3,); 0 where it is within rounding."""
+    # Corrected moments as a polynomial in the noise variance: M₀ + v M₁ + v² M₂.
     unit = shape / np.max(shape)
     none = corrected(mean, 0 * unit)
     once, twice = corrected(mean, unit) - none, corrected(mean, 2 * unit) - none
@@ -142,6 +141,7 @@ def noise(mean: Floats, shape: Floats) -> float:
 
     if smallest(0.0) <= ARITHMETIC:
         return 0.0
+    # Bracket the first root of the smallest eigenvalue, then Brent's method.
     low, high = 0.0, ARITHMETIC
     while smallest(high) > 0:
         low, high = high, high * 4
@@ -151,6 +151,7 @@ def noise(mean: Floats, shape: Floats) -> float:
 
 
 def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
+    # The null vector of the corrected moments holds the coefficients of the quadric.
     values, vectors = np.linalg.eigh(corrected(mean, variance))
     if values[1] < 1e-9 * values[-1]:
         raise DirectionsLacking
@@ -162,6 +163,7 @@ def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
             [q[1, 0, 1] / 2, q[0, 1, 1] / 2, q[0, 0, 2]],
         ]
     )
+    # Centre and H of the quadric as in the closed form; T is the upper Cholesky factor.
     linear = np.array([q[1, 0, 0], q[0, 1, 0], q[0, 0, 1]])
     try:
         centre = -0.5 * np.linalg.solve(B, linear)
@@ -172,8 +174,8 @@ def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
 
 
 def as_monomials(Q: Floats) -> Floats:
-    """(10,): the quadratic form ``(x, 1)ᵀ Q (x, 1)``, Q (4,4), as coefficients
-    of the monomials."""
+    """(10,) coefficients of the monomials in the quadratic form ``(x, 1)ᵀ Q (x, 1)``,
+    Q (4,4)."""
     out = np.zeros(len(MONOMIALS))
     for row, powers in enumerate(MONOMIALS):
         axes = [axis for axis in range(3) for _ in range(powers[axis])]
@@ -183,8 +185,8 @@ def as_monomials(Q: Floats) -> Floats:
 
 
 def design(e: Ellipsoid) -> Floats:
-    """(9,10): derivative of |T x − o|²/2 by the entries of T (row by row) and
-    o, as coefficients of the monomials."""
+    """(9,10): derivative of |T x − o|²/2 by the entries of T (row by row) and o, as
+    coefficients of the monomials."""
     forms = np.zeros((9, 4, 4))
     for n, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
         forms[n, j] = *e.T[i], -e.o[i]  # a_i x_j
@@ -194,8 +196,8 @@ def design(e: Ellipsoid) -> Floats:
 
 
 def coefficients_by_entries(e: Ellipsoid, held: Summary, reference: float) -> Floats:
-    """(9,9) derivative of scale factor, misalignment and bias by the entries of
-    T and o, by differences."""
+    """(9,9) derivative of scale factor, misalignment and bias by the entries of T and
+    o, by central differences."""
     rows, columns = np.triu_indices(3)
     start = np.concatenate([e.T[rows, columns], e.o])
 
@@ -209,42 +211,40 @@ def coefficients_by_entries(e: Ellipsoid, held: Summary, reference: float) -> Fl
 
 
 SAMPLES_LEAST = 100
-"""Nine parameters and three noises by fewer samples would be chance. Errs on
-the side of refusing."""
+"""With fewer samples, nine parameters and three noises are undetermined; a
+conservative limit."""
 ROUNDS_MOST = 20
-"""The noises of the axes follow the scale factors from fit to fit; it ends
-sooner where these no longer change."""
+"""The noise of the axes follows the scale factors from fit to fit; it ends once these
+are constant."""
 DILUTION_MOST = 100.0
-"""Largest standard error of a combination of parameters, in noises of one
-sample over the root of their number."""
+"""Largest standard error of a combination of parameters, in noises of one sample over
+the root of their number."""
 DILUTION_WARNING = 10.0
-"""A tenth of what is refused: errors still hold, but are large."""
+"""A tenth of the limit of refusal: the errors are still valid, but large."""
 UNSEEN_WARNING = 0.2
-"""Share of a coefficient's variance from which on the unknown share of the
-noise is worth a word."""
+"""Share of a coefficient's variance from which on the unknown sharing of the noise is
+reported."""
 QUICK = 0.7
-"""Share of what differences from sample to sample show that the scatter about
-the ellipsoid must at least have; with less the unit turns too fast for its
-sample rate, and they are not noise."""
+"""Least ratio of the scatter about the ellipsoid to the noise from sample to sample;
+with less the unit turns too fast for its sample rate, and the differences are not
+noise."""
 UNEQUAL = 2.5
-"""Ratio of the axes' noises from which on weights, which this fit has not,
-would lower the errors by a tenth."""
+"""Ratio of the axes' noises from which on weights, which this fit lacks, would lower
+the errors by a tenth."""
 STRETCHES_LEAST = 30
-"""With fewer, the scatter between stretches says too little for nine
-parameters."""
+"""With fewer stretches, their scatter is too uncertain for nine parameters."""
 OUTLIER_SIGMA = 6.0
-"""Robust standard deviations, which noise passes twice in 10⁹: sound stretches
-stay. What is off by less stays too, and raises the standard errors."""
+"""Limit in robust standard deviations, which noise exceeds twice in 10⁹: sound
+stretches stay. Smaller deviations stay too, and raise the standard errors."""
 OUTLIERS_MOST = 0.05
-"""Stretches that stand out so far from the others are excluded, if they are no
-more than this share."""
+"""Largest share of stretches that are excluded as outliers."""
 OUTLIER_ROUNDS = 4
-"""Large outliers hide lesser ones, so that it is looked again without them;
-ends sooner where none is left."""
+"""Large outliers mask smaller ones, so the search is repeated without them; it ends
+once none is left."""
 SPIKE = 10.0
-"""How many times farther than nine tenths of all others a stretch may reach."""
+"""Ratio of the range of an outlying stretch to that of nine tenths of the others."""
 STEPS = 0.5
-"""Noise, in steps of the output, below which rounding is no noise any more."""
+"""Noise in steps of the output below which rounding is no noise."""
 
 
 @dataclass(frozen=True)
@@ -262,8 +262,8 @@ class FewDirections(Caution):
 
 @dataclass(frozen=True)
 class StretchesDiffer(Caution):
-    """``ratio`` times as much as white noise explains; the standard errors are
-    raised by up to ``raised``."""
+    """The stretches differ by ``ratio`` times as much as white noise explains; the
+    standard errors are raised by up to ``raised``."""
 
     ratio: float
     raised: float
@@ -271,8 +271,8 @@ class StretchesDiffer(Caution):
 
 @dataclass(frozen=True)
 class NoiseUnseen(Caution):
-    """A ``share`` of the noise does not show from sample to sample, and how the
-    axes share it is not known."""
+    """A ``share`` of the noise does not show from sample to sample, and its
+    distribution over the axes is unknown."""
 
     share: float
 
@@ -287,20 +287,19 @@ class NoiseUnequal(Caution):
 
 @dataclass(frozen=True)
 class CoarseSteps(Caution):
-    """The outputs are rounded to steps larger than their noise, which the
-    standard errors do not contain."""
+    """The outputs are rounded to steps larger than their noise, which the standard
+    errors do not include."""
 
 
 @dataclass(frozen=True)
 class RotationFit:
-    """``calibration`` has no poses; its residual is that of ``stretches`` of
-    the recording, and its dilution is in noises of one sample over the root of
+    """``calibration`` has no poses; its residual is that of ``stretches`` of the
+    recording, and its dilution is in noises of one sample over the root of
     ``samples``. ``noise_g`` (3,) of one sample along each sensitive axis.
 
-    ``unseen_share`` of the noise, 0…1, does not show from sample to sample: how
-    the axes share it is not known. ``temperature`` is that of the samples that
-    were fitted, at whose mean the coefficients hold; None where it is not known
-    of all.
+    ``unseen_share`` of the noise, 0…1, does not show from sample to sample: its
+    distribution over the axes is unknown. ``temperature`` is that of the fitted
+    samples, at whose mean the coefficients hold; None where it is not known of all.
     """
 
     calibration: Calibration
@@ -314,9 +313,10 @@ class RotationFit:
 def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), reference: float = 1.0) -> RotationFit:
     """Fit the linear model to the moments of a turning unit.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. Raises Refused
-    where the samples cannot carry nine parameters, with the sides that were
-    never up; InvalidData where they are no sensor's.
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``reference`` is the
+    magnitude of gravity in its unit. Raises Refused where the samples cannot carry
+    nine parameters, with the sides that were never up; InvalidData where they are no
+    sensor's.
     """
     if moments.count < SAMPLES_LEAST:
         raise Refused(f"{moments.count} samples of a turning unit; at least {SAMPLES_LEAST} are needed")
@@ -364,12 +364,13 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
 
 
 def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
-    """Without stretches that a knock or a lost word makes outliers, which stand
-    out from all the others."""
+    """Without outlying stretches, from a knock or a lost word, which stand out from
+    all others."""
     spikes = _spiky(held)
     if spikes.any() and spikes.sum() <= max(OUTLIERS_MOST * len(spikes), 1):
         held = held.only(~spikes)
     e, unseen = _ellipsoid_and_noise(held)
+    # Repeat: fit, robust z-scores of the stretches, exclusion.
     for _ in range(OUTLIER_ROUNDS):
         judged = _Judged(held, e)
         z = judged.error / judged.noise
@@ -383,21 +384,24 @@ def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
 
 
 def _spiky(held: Summary) -> Bools:
-    """Stretches that reach far beyond nearly all others: no fit could begin
-    with them."""
+    """Stretches with a range far beyond that of nearly all others, with which no fit
+    could begin."""
     reach = held.reach
     return np.asarray((reach > SPIKE * np.quantile(reach, 0.9, axis=0)).any(axis=1))
 
 
 def _ellipsoid_and_noise(held: Summary) -> tuple[Ellipsoid, float]:
-    """And the share of the noise of which it is not known how the axes share
-    it."""
+    """The ellipsoid, and the share of the noise whose distribution over the axes is
+    unknown."""
     mean = held.mean()
+    # Distribution from the differences of samples, where these explain most of the
+    # noise.
     if np.all(held.quick > 0):
         ratio = noise(mean, held.quick)
         if ratio > QUICK:
             by_chance = 1 + 4 * np.sqrt(8 / held.count)
             return fitted(held, held.quick), max(0.0, 1 - by_chance / ratio)
+    # Otherwise equal noise in g on all axes, iterated with the scale factors.
     k = held.half.copy()
     for _ in range(ROUNDS_MOST):
         e = fitted(held, (k / held.half) ** 2)  # taken to be alike in g, hence unlike in scaled units
@@ -408,8 +412,8 @@ def _ellipsoid_and_noise(held: Summary) -> tuple[Ellipsoid, float]:
 
 
 def _by_share(held: Summary, e: Ellipsoid, reference: float) -> Floats:
-    """(9,3): change of the coefficients were the share of the noise in one axis
-    twice as large as it was taken."""
+    """(9,3): change of the coefficients if the share of the noise in one axis
+    doubled, by differences."""
     step = 0.05
     start = np.concatenate(e.coefficients(held, reference))
     if not np.all(e.variance > 0):
@@ -419,20 +423,23 @@ def _by_share(held: Summary, e: Ellipsoid, reference: float) -> Floats:
 
 
 class _Judged:
-    """Stretches under a fit. ``error`` (m,): mean of |a| − 1 in each, ``noise``
-    (m,) its standard error."""
+    """Stretches under a fit. ``error`` (m,): mean of |a| − 1 in each, ``noise`` (m,)
+    its standard error."""
 
     def __init__(self, held: Summary, e: Ellipsoid) -> None:
         self.counts, self.count = held.counts, held.count
+        # Corrected moments; |a|² and its derivatives as coefficients of the monomials.
         moments = corrected(held.moments, e.variance)
         squares = np.concatenate([e.T, -e.o[:, None]], axis=1)  # a = squares @ (x, 1)
         self.across = e.T * np.sqrt(e.variance + ARITHMETIC)
         rows, ones = design(e), moments[:, MONOMIALS.index((0, 0, 0))]
+        # (|a|² − 1)/2 ≈ |a| − 1, and the noise variance of |a| along a.
         miss = as_monomials(squares.T @ squares - np.diag([0.0, 0.0, 0.0, 1.0])) / 2
         along = as_monomials(squares.T @ self.across @ self.across.T @ squares)
         self.error = ones @ miss
         self.variance = np.maximum(ones @ along, 1e-300)
         self.noise = np.sqrt(self.variance / self.counts)
+        # Scores and information of the nine entries.
         self.mean_row = ones @ rows.T
         self.scores = (moments @ miss) @ rows.T
         self.information = rows @ np.einsum("m,mij->ij", self.counts / self.count, moments) @ rows.T
@@ -459,18 +466,19 @@ class _Judged:
         return float(f_sf(float(np.sum((self.error / self.noise) ** 2)) / left, left, self.count - 9))
 
     def covariance(self, *, raised: bool) -> tuple[Floats, float]:
-        """(9,9) of the entries of T and o, and by how much its standard errors
-        were raised at most.
+        """(9,9) covariance of the entries of T and o, and the largest factor by which
+        its standard errors were raised.
 
-        From white noise; where that is not all, what the stretches scatter,
-        wherever it is more.
+        From white noise, and from the scatter of the stretches where this is larger.
         """
+        # White noise: inverse information times the mean variance.
         inverse = np.linalg.inv(self.information)
         white = inverse * float(self.variance @ self.counts) / self.count**2
         factor = self._unequal()
         white = white * np.outer(factor, factor)
         if not raised:
             return white, 1.0
+        # Sandwich estimate from the scores of the stretches, at increasing lengths.
         score = self.scores * self.counts[:, None] / self.count
         most = np.diag(white)
         while len(score) >= STRETCHES_LEAST:  # neighbours put together, again and again: what drifts is no chance
@@ -481,10 +489,9 @@ class _Judged:
         return white * np.outer(factor, factor), float(factor.max())
 
     def _unequal(self) -> Floats:
-        """(9,) by what factor noise that differs from direction to direction
-        changes the standard errors."""
-        # The moments end at the fourth degree, this needs the sixth; some of
-        # the samples tell it well enough.
+        """(9,) factors on the standard errors for noise that depends on the
+        direction."""
+        # This needs moments of the sixth degree, which some of the samples approximate.
         J = linear_design(self.directions, self.directions)
         variance = np.sum((self.directions @ self.across) ** 2, axis=1)
         bread = np.linalg.pinv(J.T @ J)
@@ -493,8 +500,8 @@ class _Judged:
 
 
 def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
-    """Sides that were never up, as far as the directions can be determined
-    without a fit."""
+    """Sides that were never up, as far as the directions can be determined without a
+    fit."""
     # Without one scale for all, an axis that hardly moved would look like one
     # that swung from end to end.
     u = (held.sampled - np.median(held.sampled, axis=0)) / np.max(held.half) * signs
@@ -505,8 +512,8 @@ def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
 
 
 def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) -> Iterator[Caution]:
-    """``unseen``: the largest share that the unknown share of the noise has in
-    the variance of a coefficient."""
+    """``unseen``: largest share of a coefficient's variance that is due to the
+    unknown distribution of the noise."""
     c = found.calibration
     if gone := whole.count - held.count:
         yield StretchesExcluded(len(whole.counts) - len(held.counts), gone)
@@ -524,12 +531,12 @@ def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) 
 
 
 def _variance(found: RotationFit, held: Summary) -> Floats:
-    """(3,) of the noise in scaled units."""
+    """(3,) variance of the noise in scaled units."""
     return np.asarray((found.noise_g * found.calibration.sensor.scale_factor / held.half) ** 2)
 
 
 def _step(held: Summary) -> Floats:
-    """(3,) of which all outputs are whole multiples; 0 where there is none."""
+    """(3,) step of which all outputs are multiples; 0 where there is none."""
     out = np.zeros(3)
     for axis in range(3):
         gaps = np.diff(np.unique(held.sampled[:, axis]))

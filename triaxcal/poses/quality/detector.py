@@ -1,10 +1,11 @@
-"""The detector: fed a stream in blocks of any size, it keeps what the judges of
-data quality need.
+"""The detector of data quality: summaries of a stream that is fed in blocks of any
+size.
 
-The stream is cut anew into chunks that depend on the samples alone, so that
-live and replayed streams are judged alike. Memory grows with time, not with the
-sample rate: about a hundred bytes for each tenth of a second, and for the first
-hours three thousand for a second of spectra."""
+The stream is cut into chunks that depend on the samples alone, so live and replayed
+streams are judged alike. Memory grows with time, not with the sample rate: about a
+hundred bytes for each tenth of a second, and in the first hours three thousand for a
+second of spectra.
+"""
 
 from __future__ import annotations
 
@@ -41,17 +42,15 @@ from triaxcal.poses.stillness.windows import (
 )
 
 CHUNK_LEAST = 4096
-"""Samples that are judged at once, 256 blocks of noise: enough for their
-quantiles, and little memory. Not less at slow rates, where a chunk then lasts
-longer."""
+"""Samples judged at once, 256 blocks of noise: enough for quantiles, with little
+memory. The same at slow rates, where a chunk lasts longer."""
 
 
 @dataclass
 class QualityDetector:
-    """Feed it blocks of any size, `finish`, then ask for `findings`.
+    """Feed it blocks of any size, `finish`, then read `findings`.
 
-    Before `finish` the findings are those of the samples up to the last whole
-    chunk.
+    Before `finish` the findings are those of the samples up to the last whole chunk.
     """
 
     samples: int = 0
@@ -77,7 +76,7 @@ class QualityDetector:
             self._take_chunks()
 
     def finish(self) -> None:
-        """No more samples come."""
+        """End of the stream."""
         if not self._period_ns and self._held >= RATE_LEAST:
             self._learn_rate()
         if self._period_ns:
@@ -103,7 +102,7 @@ class QualityDetector:
         self._pending, self._held = [(time_ns[at:], readings[at:])], len(time_ns) - at
 
     def _take(self, time_ns: Ints, u: Floats) -> None:
-        """``u`` (3,n)."""
+        """Summarise a chunk ``u`` (3,n)."""
         self.samples += len(time_ns)
         self._low = np.minimum(self._low, u.min(axis=1))
         self._high = np.maximum(self._high, u.max(axis=1))
@@ -116,8 +115,8 @@ class QualityDetector:
         self._spectra.feed(time_ns, u)
 
     def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[QualityFinding]:
-        """One for each kind of fault, with the still ``spans`` that windows
-        ``w`` of the same stream show."""
+        """One finding for each kind of fault, with the still ``spans`` from windows
+        ``w`` of the same stream."""
         if not self.samples or self._begin_ns is None:
             return []
         holds = StillIntervals.of(self._begin_ns, w, spans)
@@ -131,9 +130,11 @@ class QualityDetector:
         rate_hz = 1e9 / self._period_ns
         cells = self._cells.cells()
         rails, affected = faults.saturation(cells, self._runs, holds, step, roughness, noisy)
+        # Rails, frozen runs, and the poses that they affect.
         frozen = faults.frozen_runs(cells, self._runs, noisy)
         for poses, runs in zip(affected, frozen, strict=False):
             poses.update(i for r in (*runs, *frozen[-1]) for i in holds.touched(r.start_ns, r.end_ns))
+        # Repeated samples, dead axes, mains lines.
         slow, twice = faults.repeated_samples(self._runs, noisy, rate_hz)
         flat = self._low == self._high
         dead = [axis for i, axis in enumerate("xyz") if flat[i] and not flat.all()]
@@ -156,12 +157,12 @@ class QualityDetector:
         return MissingSamples(g.missing, self.samples + g.missing, g.gaps, g.longest, first_s)
 
 
-# What the poses themselves are to be blamed for: shaking, and moves that it hid.
+# Faults of the poses themselves: vibration, and moves hidden by it.
 
 
 def disturbances(poses: Sequence[Pose]) -> list[QualityFinding]:
-    """Of the poses of one recording, in order of time: those that are shaken,
-    in a part or all through, and those that a move parts which shaking hid."""
+    """Faults of the poses of one recording, in order of time: vibration in a part or
+    throughout, and moves hidden by vibration."""
     found: list[QualityFinding] = []
     by_pose = [_of(p) for p in poses]
     if all_of_them := tuple(itertools.chain.from_iterable(by_pose)):

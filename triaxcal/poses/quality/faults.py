@@ -1,5 +1,5 @@
-"""Judges of what was kept of a stream: rails, frozen outputs, repeated samples,
-steps too coarse for the noise."""
+"""Detection of faults in the summaries of a stream: rails, frozen outputs, repeated
+samples, steps too coarse for the noise."""
 
 from __future__ import annotations
 
@@ -26,44 +26,42 @@ from triaxcal.poses.quality.finding import (
 )
 from triaxcal.poses.stillness.windows import noise_of
 
-# The extremes of every tenth of a second and how often they were read, and the step
-# of the output.
+# Extremes of every tenth of a second with their counts, and the step of the output.
 
 LATTICE = 20.5
-"""Differences up to so many steps tell whether there are steps at all."""
+"""Differences up to so many steps decide whether there are steps."""
 OFF_LATTICE = 0.05
-"""Steps by which a difference may miss a whole number of them; one in ten is as
-near by chance."""
+"""Steps by which a difference may deviate from a multiple; one in ten is as near by
+chance."""
 LATTICE_LEAST = 8
 """Differences that have to lie on the lattice: by chance as many do once in ten
 million."""
 COARSE = 0.5
-"""Noise in steps, of a sample: with less, readings rest on one value for long."""
+"""Noise of a sample in steps: with less, readings stay on one value for long."""
 HUSHED = 0.35
-"""The same for the quietest tenth of the blocks, which chance makes quieter
-than the rest."""
+"""The same for the quietest tenth of the blocks, which are quieter by chance."""
 BLOCK = 16
-"""Samples in a block. Longer ones hold noise and motion at once; of shorter
-ones chance decides which it is."""
+"""Samples in a block. Longer ones mix noise and motion; in shorter ones chance
+decides which it is."""
 BLOCKS_LEAST = 4
-"""Blocks of noise in a chunk below which their quantiles say nothing."""
+"""Blocks of noise in a chunk below which their quantiles are unreliable."""
 NOISE_LIKE = 0.4
-"""Variance by fourth differences over that by second ones: 1 for white noise,
-next to 0 for smooth motion. Nearer to 1 sound noise is lost by chance."""
+"""Ratio of the variances by fourth and by second differences: 1 for white noise, near
+0 for smooth motion. A higher limit loses sound noise by chance."""
 NOISY_SHARE = 0.2
-"""Of all blocks: moves and stretches without noise may fill the others."""
+"""Least share of noisy blocks: moves and stretches without noise may fill the
+others."""
 NOISELESS = 1e-13
-"""Scatter, as a share of the readings, that the arithmetic makes."""
+"""Scatter due to rounding of the arithmetic, as a share of the readings."""
 FINEST = 1e-10
-"""A step below this share of the readings is rounding of the arithmetic."""
+"""Smallest step as a share of the readings: less is rounding of the arithmetic."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Stretches of equal length: ``start_ns``, ``end_ns`` (m,); ``high``,
-    ``low`` (m,3) extremes of the readings, ``at_high``, ``at_low`` (m,3) how
-    many samples read exactly that. ``size`` samples in each.
-    """
+    """Stretches of equal length: ``start_ns``, ``end_ns`` (m,); ``high``, ``low``
+    (m,3) extremes of the readings, ``at_high``, ``at_low`` (m,3) numbers of samples
+    at exactly that value. ``size`` samples in each."""
 
     size: int
     start_ns: Ints
@@ -79,7 +77,7 @@ class Cells:
 
 @dataclass
 class CellKeeper:
-    """Fed whole cells, in order."""
+    """Collects cells from whole cells of samples, in order."""
 
     size: int
     _done: list[tuple[Any, ...]] = field(default_factory=list)  # as Cells has them, behind its size
@@ -106,8 +104,8 @@ class CellKeeper:
 
 @dataclass
 class StepEstimator:
-    """Learns the smallest step of each axis, and its noise from sample to
-    sample, from chunks of the stream."""
+    """Estimates the smallest step of each axis, and its noise from sample to sample,
+    from chunks of the stream."""
 
     _least: list[Floats] = field(default_factory=list)
     _rough: list[list[float]] = field(default_factory=lambda: [[], [], []])
@@ -122,7 +120,9 @@ class StepEstimator:
         difference = np.diff(u, axis=1)
         size = np.abs(difference)
         largest = np.abs(u).max(axis=1)
+        # The smallest difference of each axis, if all lie on its lattice.
         self._least.append(np.array([_step(size[axis], FINEST * largest[axis]) for axis in range(3)]))
+        # Noise variance by second differences, whose gain is 6, in blocks.
         second, count = np.diff(difference, axis=1), (u.shape[1] - 4) // BLOCK
         rough = _mean_square(second, count) / 6
         # Noise is as large in fourth differences as in second ones; what moves
@@ -140,8 +140,8 @@ class StepEstimator:
                 self._least_rough[axis] = min(self._least_rough[axis], float(low))
 
     def step(self) -> Floats:
-        """(3,) the smallest difference between readings, zero where they lie on
-        no lattice of steps that shows."""
+        """(3,) smallest difference between readings, zero where they do not lie on a
+        lattice."""
         if not self._least:
             return np.zeros(3)
         least = np.array(self._least)
@@ -149,25 +149,22 @@ class StepEstimator:
         return np.where(np.isfinite(found), found, 0.0)
 
     def roughness(self) -> Floats:
-        """(3,) standard deviation of the noise of a sample, as far as it
-        differs from sample to sample; zero where most of the stream has none.
-        """
+        """(3,) standard deviation of the noise from sample to sample; zero where most
+        of the stream has none."""
         out = np.zeros(3)
         for axis in np.flatnonzero(self._noisy > NOISY_SHARE * self._blocks).tolist():
             out[axis] = np.sqrt(np.median(self._rough[axis])) if self._rough[axis] else 0.0
         return out
 
     def scatters(self, step: Floats) -> Bools:
-        """(3,) whether the noise is wider than half a ``step`` (3,), so that
-        readings rest on no value for long: as a rule, and not much less in any
-        part of the stream, as where a machine that shakes the stand is switched
-        off.
-        """
+        """(3,) whether the noise exceeds half a ``step`` (3,), so that readings do
+        not stay on one value: in the median, and nearly so in every part of the
+        stream, such as after a vibrating machine is switched off."""
         return np.asarray((self.roughness() > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
 
 
 def _mean_square(differences: Floats, count: int) -> Floats:
-    """(3,count) in blocks."""
+    """(3,count) mean squares in blocks."""
     blocks = differences[:, : count * BLOCK].reshape(3, count, BLOCK)
     return np.asarray(np.einsum("ijk,ijk->ij", blocks, blocks) / BLOCK)
 
@@ -183,30 +180,28 @@ def _step(size: Floats, floor: float) -> float:
     return least
 
 
-# Runs of equal readings: how long they are as a rule, and the longest ones.
+# Lengths of runs of equal readings, and the longest runs.
 
 ROWS = 4
 """The three axes, and all of them together."""
 LONGEST_COUNTED = 4096
-"""Lengths that are counted each by itself; longer runs count as this long, and
-are kept besides."""
+"""Lengths that are counted individually; longer runs count as this long, and are kept
+as well."""
 KEPT_LEAST = 8
-"""Samples in a run from which on it is kept by itself: shorter ones are common
-in sound noise. A frozen output of fewer samples is not told."""
+"""Least samples of a run that is kept: shorter ones are common in sound noise. A
+shorter freeze of the output is not detected."""
 KEPT_MOST = 256
-"""Longest runs that are kept of each row, which bounds the memory; all others
-are counted."""
+"""Largest number of runs that are kept of each row, which bounds the memory; all
+others are counted."""
 RUNS_LEAST = 200
-"""Runs from which it is learned how long they are."""
+"""Number of runs from which their length is estimated."""
 FALSE_ALARM = 1e-4
-"""Probability, in a stream, of a run by chance that is called a fault."""
+"""Probability of a false alarm in a stream."""
 MARGIN = 1.5
-"""By which the tail may fall more slowly than was learned, from one run in a
-thousand."""
+"""Factor on the decay length of the tail beyond one run in a thousand."""
 SCALE_LEAST = 0.3
-"""Samples over which the tail falls by a factor of e, at least: as though one
-sample in 28 repeated, where fewer do. Errs on the side of calling nothing a
-fault."""
+"""Least decay length of the tail in samples: as though one sample in 28 repeated,
+where fewer do. A conservative limit."""
 
 
 @dataclass(frozen=True)
@@ -221,10 +216,10 @@ class EqualRun:
 
 @dataclass
 class RunLengths:
-    """Fed chunks of the stream in order; a run may go on from chunk to chunk."""
+    """Fed chunks of the stream in order; a run may continue from chunk to chunk."""
 
     by_chance: float = 0.0
-    """How often all axes are expected to repeat at once."""
+    """Expected number of simultaneous repeats of all axes."""
     counts: Ints = field(default_factory=lambda: np.zeros((ROWS, LONGEST_COUNTED + 1), dtype=np.int64))
     _long: list[list[EqualRun]] = field(default_factory=lambda: [[] for _ in range(ROWS)])
     _fed: int = 0
@@ -236,6 +231,7 @@ class RunLengths:
     def feed(self, time_ns: Ints, u: Floats) -> None:
         """``u`` (3,n)."""
         n = len(time_ns)
+        # Whether each axis, and any axis, changes at each sample.
         changed = np.empty((ROWS, n), dtype=bool)
         changed[:3, 0] = u[:, 0] != self._last if self._fed else False
         np.not_equal(u[:, 1:], u[:, :-1], out=changed[:3, 1:])
@@ -251,7 +247,8 @@ class RunLengths:
         self._last, self._last_ns = u[:, -1].copy(), int(time_ns[-1])
 
     def _close(self, row: int, at: Ints, time_ns: Ints, u: Floats) -> None:
-        """The runs that end before the changes at ``at``."""
+        """Count the runs that end before the changes at ``at``, and keep the long
+        ones."""
         length = np.diff(at, prepend=self._start[row] - self._fed)
         self.counts[row] += np.bincount(np.minimum(length, LONGEST_COUNTED), minlength=LONGEST_COUNTED + 1)
         for i in np.flatnonzero(length >= KEPT_LEAST):
@@ -264,35 +261,37 @@ class RunLengths:
         self._start[row], self._start_ns[row] = self._fed + int(at[-1]), int(time_ns[at[-1]])
 
     def runs(self, row: int) -> list[EqualRun]:
-        """The longest runs, by time, with the one that is not over yet."""
+        """The longest runs by time, with the unfinished one."""
         last = self._fed - self._start[row]
         open_run = [EqualRun(self._start_ns[row], self._last_ns, last, float(self._last[row % 3]))] if last else []
         return sorted(_longest(self._long[row], 0) + open_run, key=lambda r: r.start_ns)
 
     def allowed(self, row: int) -> float:
-        """The longest run that the noise makes, by how the tail of the run
-        lengths falls; infinite where not known.
+        """Longest run that noise explains, from the decay of the run lengths;
+        infinite where unknown.
 
-        Runs of a scattering output end at any sample with some chance, so that
-        their tail is exponential at most. It is learned from how often samples
-        repeat, and where one run in a hundred and one in a thousand end, which
-        a frozen output does not shift.
+        Runs of a noisy output end at any sample with some probability, so their tail
+        is at most exponential. Its decay follows from the share of repeated samples
+        and from the quantiles at one run in a hundred and in a thousand, which a
+        frozen output does not shift.
         """
         counts = self.counts[row]
         total = int(counts.sum())
         if total < RUNS_LEAST:
             return float("inf")
+        # Quantiles 0.99 and 0.999 of the length, and the share of repeated samples.
         above = np.cumsum(counts)
         high, higher = (int(np.searchsorted(above, q * total)) for q in (0.99, 0.999))
         length = np.arange(1, higher + 1)
         usual = counts[1 : higher + 1]
         repeating = float(((length - 1) * usual).sum() / max((length * usual).sum(), 1))
+        # The largest decay length, then the extreme quantile for the false-alarm rate.
         scale = max(SCALE_LEAST, (higher - high) / np.log(10.0), -1 / np.log(max(repeating, 1e-300)))
         return float(higher + MARGIN * scale * np.log(max(total / 1000, 1.0) / FALSE_ALARM))
 
     def repeated(self, row: int, most: float) -> tuple[int, int]:
-        """Samples that repeat the one before, in runs of up to ``most``, and
-        all samples in such runs."""
+        """Samples that repeat the previous one, in runs of up to ``most``, and all
+        samples in such runs."""
         upto = min(int(most), LONGEST_COUNTED - 1) + 1
         length = np.arange(upto)
         counts = self.counts[row, :upto]
@@ -300,10 +299,9 @@ class RunLengths:
 
 
 def _by_chance(changed: Bools) -> float:
-    """From ``changed`` (3,n): what the other combinations of axes that repeat
-    let expect, whatever any two axes have in common (the log-linear model
-    without the interaction of all three; Bishop, Fienberg and Holland 1975).
-    """
+    """Expected number of simultaneous repeats from ``changed`` (3,n), given the other
+    combinations of repeating axes (log-linear model without the interaction of all
+    three; Bishop, Fienberg and Holland 1975)."""
     n = np.bincount((~changed).astype(np.int8).T @ np.array([1, 2, 4], dtype=np.int8), minlength=8).astype(float)
     return float(n[0] * n[3] * n[5] * n[6] / np.maximum(n[[1, 2, 4]], 1.0).prod())
 
@@ -315,49 +313,50 @@ def _longest(found: list[EqualRun], unless: int) -> list[EqualRun]:
 
 
 RAIL_LEAST = 10
-"""Readings at a rail beyond `RAIL_TIMES` those of other poses: poses of few are
+"""Readings at a rail beyond `RAIL_TIMES` those of other poses: poses with fewer are
 not judged."""
 RAIL_TIMES = 3
-"""As often as any other pose reads its own extreme: vibration too dwells at its
+"""Ratio to the count at the extreme of any other pose: vibration too dwells at its
 extremes."""
 REFERENCES_LEAST = 4
-"""Other poses that say how often an extreme is read; with fewer, chance says
-it."""
+"""Number of other poses with extremes for the comparison; with fewer, chance
+decides."""
 CLIPPED_LEAST = 3
 """Readings at a known rail: one or two are the tail of the noise, or a knock."""
 CLIPPED_SHARE = 0.005
-"""Of a pose. Gaussian noise that is cut off there has its mean shifted by
-0.0016 of its standard deviation: less than that does no harm."""
+"""Share of a pose at the rail. Gaussian noise that is clipped there shifts its mean
+by 0.0016 of its standard deviation: less is harmless."""
 SMOOTH = 2.0
-"""Scatter in steps above which no single code is much more frequent than those
-beside it."""
+"""Scatter in steps above which no single code is much more frequent than its
+neighbours."""
 APART = 20.0
-"""Steps between the extreme and the fifth value below it from which on a
-coincidence is reckoned: nearer ones are the tail of the noise."""
+"""Steps between the extreme and the fifth value below it, from which on a coincidence
+is tested: nearer ones are the tail of the noise."""
 COINCIDENCE = 1e-4
-"""Probability below which the same extreme, reached several times, is a rail
-and no chance."""
+"""Probability of a coincidence below which the same extreme, reached several times,
+is a rail."""
 FULL_SCALE_BITS = (15, 17, 19, 23, 31)
-"""Largest magnitudes of two's complement numbers that no nominal scale factor
-makes out of 1 g."""
+"""Exponents of the largest two's complement numbers, which no nominal scale factor
+gives for 1 g."""
 SLOW_SHARE = 0.1
-"""Of samples that repeat: up to this some came twice, above it the sensor
-updates more slowly than it is read."""
+"""Share of repeated samples: below it some came twice, above it the sensor updates
+more slowly than it is read."""
 REPEATS_LEAST = 10
-"""Repeats from which on their number says more than chance."""
+"""Least number of significant repeats."""
 REPEATED_SHARE = 0.002
-"""Beyond twice what chance expects, which is itself an estimate: less does no
-harm."""
+"""Share of repeats beyond twice the expectation, itself an estimate; less is
+harmless."""
 
 
 def saturation(
     cells: Cells, runs: RunLengths, holds: StillIntervals, step: Floats, scatter: Floats, noisy: Bools
 ) -> tuple[QualityFinding | None, list[set[int]]]:
-    """And the poses that lie at a rail, by axis."""
+    """A fault of saturation, and the poses at a rail, by axis."""
     rails: list[AtRail] = []
     affected: list[set[int]] = [set(), set(), set()]
     place = holds.within(cells.start_ns, cells.end_ns)
     for axis in np.flatnonzero(noisy).tolist() if len(cells) else ():
+        # Test the extremes of every noisy axis, upper and lower.
         long = [r for r in runs.runs(axis) if r.samples > runs.allowed(axis)]
         for side, rail in zip((1, -1), _extremes(cells, axis), strict=True):
             value, count = _side(cells, axis, side)
@@ -379,9 +378,8 @@ def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
 
 
 def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[EqualRun]]:
-    """By axis, and last of all axes at once, the runs that are longer than
-    noise allows. Those of one axis at its extremes are rails.
-    """
+    """Runs longer than noise explains, by axis, and last those of all axes at once.
+    Runs of one axis at its extremes are rails."""
     found: list[list[EqualRun]] = [[], [], [], []]
     if not (len(cells) and noisy.any()):
         return found
@@ -400,16 +398,17 @@ def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[Equal
 
 
 def _side(cells: Cells, axis: int, side: int) -> tuple[Floats, Floats]:
-    """Extremes of one side, turned so that they are the highest, and how often
-    they were read."""
+    """Extremes of one side, with the sign that makes them maxima, and their
+    counts."""
     if side > 0:
         return cells.high[:, axis], cells.at_high[:, axis].astype(float)
     return -cells.low[:, axis], cells.at_low[:, axis].astype(float)
 
 
 def _piled(value: Floats, count: Floats, place: Ints, rail: float) -> list[int]:
-    """Poses in which the rail was read far more often than the extremes of
-    other poses."""
+    """Poses in which the rail was read far more often than other poses read their
+    extremes."""
+    # Top reading of every pose, its count, and the number of cells.
     tops: dict[int, tuple[float, float, int]] = {}
     for pose in np.unique(place[place >= 0]):
         inside = place == pose
@@ -427,7 +426,7 @@ def _piled(value: Floats, count: Floats, place: Ints, rail: float) -> list[int]:
 
 
 def _clipped(at_rail: Floats, place: Ints, size: int) -> list[int]:
-    """Poses of which a share lies at a rail that is known to be one."""
+    """Poses with a share of readings at a known rail."""
     inside = place >= 0
     if not inside.any():
         return []
@@ -437,12 +436,13 @@ def _clipped(at_rail: Floats, place: Ints, size: int) -> list[int]:
 
 
 def _coincident(value: Floats, step: float, scatter: float) -> bool:
-    """Whether the same extreme was reached at several times, where the next
-    ones lie too far apart for chance."""
+    """Whether the same extreme was reached at several times, with the next values too
+    far away for chance."""
     number = int(np.count_nonzero(np.diff(np.flatnonzero(value == value.max())) > 1)) + 1
     if number < 2 or scatter < SMOOTH * step:
         return False
     step = max(step, scatter / 100)  # without steps no reading comes twice
+    # Probability that several extremes coincide within one step: (5/apart)^(n−1).
     below = np.sort(value[value < value.max()])[::-1]
     if len(below) < 5:
         return False
@@ -473,10 +473,9 @@ def stuck_output(
 def repeated_samples(
     runs: RunLengths, noisy: Bools, rate_hz: float
 ) -> tuple[SlowUpdate | None, DuplicateSamples | None]:
-    """Samples that repeat the one before on all axes: of a sensor that is read
+    """Samples that repeat the previous one on all axes: of a sensor that is read
     faster than it updates, or single ones that came twice. Neither where noise
-    explains them.
-    """
+    explains them."""
     most = runs.allowed(3)
     if noisy.sum() < 2 or not np.isfinite(most):
         return None, None
@@ -494,10 +493,9 @@ def repeated_samples(
 
 
 def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], step: Floats) -> QualityFinding | None:
-    """Where steps are wider than twice the scatter in the poses, so that a mean
-    keeps part of its rounding error; ``affected`` are poses, by axis, that lack
-    their scatter for another reason.
-    """
+    """Axes with steps wider than twice the scatter in the poses, so that a mean keeps
+    part of its rounding error; ``affected`` are poses, by axis, that lack their
+    scatter for another reason."""
     axes = []
     for axis in np.flatnonzero(step > 0).tolist():
         sound = [i for i in range(len(holds)) if i not in affected[axis]]
@@ -512,43 +510,39 @@ def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], ste
 
 
 def _rounding_error(variance: float) -> float:
-    """The largest error of a mean of rounded readings over all places between
-    two steps, in steps, where rounded readings have ``variance`` on average
-    over the places (Widrow and Kollár 2008, Quantization Noise: the harmonics
-    of the rounding error under Gaussian noise).
-    """
+    """Largest error of a mean of rounded readings over all places between two steps,
+    in steps, for rounded readings of mean ``variance`` (Widrow and Kollár 2008,
+    Quantization Noise: harmonics of the rounding error under Gaussian noise)."""
+    # Σ (−1)ᵏ/(πk) sin(2πkx) exp(−2π²k²σ²).
     noise = float(noise_of(np.array([variance]))[0])
     k, place = np.arange(1, 50)[:, None], np.linspace(0, 0.5, 101)
     waves = (-1.0) ** k / (np.pi * k) * np.sin(2 * np.pi * k * place) * np.exp(-2 * np.pi**2 * k**2 * noise**2)
     return min(float(np.abs(waves.sum(axis=0)).max()), 0.5)
 
 
-# Samples that are missing by the time stamps alone.
+# Missing samples, from the time stamps alone.
 
 OFF_CLOCK = 0.2
-"""Time stamps of an even clock: steps within this many periods of a whole
-number of them."""
+"""For time stamps of an even clock: steps within this many periods of a multiple."""
 EVEN_SHARE = 0.95
-"""Of steps that are whole periods, from which on the clock is even: a few may
-be late."""
+"""Share of steps that are whole periods in an even clock; a few may be late."""
 EVEN_LEAST = 0.4
-"""Median step over the average period below which samples come in bursts: half
-of the steps lie within one then, and say nothing of the period."""
+"""Median step over the average period below which samples come in bursts: half of the
+steps then lie within a burst and do not show the period."""
 BESIDE = 64
-"""Samples on each side of a gap whose earliest stamps are compared: more find a
-prompter one, but two gaps within them count as one."""
+"""Samples on each side of a gap whose earliest stamps are compared: more find a less
+delayed one, but two gaps within them count as one."""
 SHIFT_LEAST = 0.75
-"""Of uneven time stamps, a gap is what shifts all that follow by so many
-periods."""
+"""For uneven time stamps: a gap shifts all that follow by so many periods."""
 LONG = 3.5
-"""Periods: of uneven stamps only steps above three are looked at, since late
-ones make others."""
+"""In periods: for uneven stamps only steps above three are examined, since late
+stamps cause others."""
 
 
 @dataclass
 class Gaps:
-    """Counts what is missing between samples. Fed chunks of the stream; judges
-    a step when what follows it is known."""
+    """Counts the samples missing between others. Fed chunks of the stream; judges a
+    step once its sequel is known."""
 
     missing: int = 0
     gaps: int = 0
@@ -567,12 +561,14 @@ class Gaps:
         self._held, self._judged = held[keep:].copy(), max(until, self._judged) - keep
 
     def _judge(self, time_ns: Ints, until: int) -> None:
+        # Period of the samples, over many bursts if there are any.
         step = np.diff(time_ns).astype(float)
         lag = max(len(step) // 2, 1)  # over many bursts, if there are any
         average, period = float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, float(np.median(step))
         if period < EVEN_LEAST * average:  # they come in bursts
             period = average
         ratio = step / period
+        # An even clock gives whole steps; else gaps shift the clock permanently.
         even = np.mean((np.abs(ratio - np.rint(ratio)) < OFF_CLOCK) & (ratio > 0.5)) >= EVEN_SHARE
         lost = np.rint(ratio) - 1 if even else _shifts((time_ns - time_ns[0]) / average, ratio)
         for i in range(self._judged, min(until, len(step))) if (lost >= 1).any() else ():
@@ -588,10 +584,10 @@ class Gaps:
 
 
 def _shifts(periods: Floats, ratio: Floats) -> Floats:
-    """(n-1,) whole periods by which each long step shifts the clock for good:
-    samples that are only late catch up. ``periods`` (n,) are the times in
-    average periods.
-    """
+    """(n-1,) whole periods by which each long step shifts the clock permanently:
+    samples that are only late catch up. ``periods`` (n,) are the times in average
+    periods."""
+    # Delay of every sample against an even clock; the longest steps first.
     late = periods - np.arange(len(periods))
     lost = np.zeros(len(ratio))
     # The average period is off by a burst in half of all samples.

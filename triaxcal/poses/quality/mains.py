@@ -1,9 +1,7 @@
-"""Lines of the mains in the spectrum of still poses, at their own frequency or
-folded down by the sampling.
+"""Mains lines in the spectrum of still poses, at their own frequency or as aliases.
 
-Segments of a second, half overlapping, through a Hann window (Welch 1967); of
-each only the bins about the frequencies in question are kept until it is known
-where the unit stood still.
+Segments of a second, half overlapping, with a Hann window (Welch 1967); only the bins
+about the frequencies in question are kept until the still spans are known.
 """
 
 from __future__ import annotations
@@ -21,53 +19,51 @@ from triaxcal.poses.quality.finding import MainsPickup, StillIntervals, Tone
 MAINS_HZ = (50.0, 60.0)
 """Nominal frequencies of the public grids."""
 HARMONICS = (1, 2, 3)
-"""The mains and two harmonics. Each more is one more place at which noise, or a
-motor, may pass for it."""
+"""The mains and two harmonics. Each further one is one more place where noise, or a
+motor, may be taken for it."""
 TOLERANCE = 0.02
-"""The mains wander by half a hertz in fifty, and the sampling clock is off by
-up to one percent."""
+"""Relative tolerance: the mains wander by half a hertz in fifty, and the sampling
+clock by up to one percent."""
 SEGMENT_S = 1.0
-"""One bin is 1 Hz then. Longer segments fit into fewer poses; shorter ones do
-not part a line from the noise beside it."""
+"""Length of a segment; one bin is 1 Hz then. Longer segments fit into fewer poses;
+shorter ones do not separate a line from the noise next to it."""
 SEGMENT_LEAST = 16
-"""Samples in a segment where the rate is low; no band of the mains has room in
-so few bins."""
+"""Least samples in a segment at low rates; so few bins have no room for a band."""
 SEGMENTS_MOST = 2**15
-"""Segments that are kept, of four and a half hours: at 1 kHz they take 60 MB.
-Of a longer stream it is every second one, every fourth and so on."""
+"""Number of segments that are kept, of four and a half hours: at 1 kHz they take 60
+MB. Of a longer stream every second one is kept, every fourth, and so on."""
 SEGMENTS_LEAST = 8
-"""Segments of still poses below which their mean spectrum is too rough to
-judge."""
+"""Segments of still poses below which their mean spectrum is too uncertain."""
 GAP = 4.0
-"""A silence longer than this many sample periods ends a segment."""
+"""Sample periods of silence after which a segment ends."""
 GUARD = 3
-"""Bins from a band to its flank: a line at its edge reaches two through a Hann
+"""Bins from a band to its flank: a line at its edge extends over two through a Hann
 window."""
 FLANK = 8
-"""Bins beside a band: a line at its edge reaches the first ones, the others
-show the noise."""
+"""Bins of a flank: a line at the edge extends into the first ones, the others show
+the noise."""
 FALSE_ALARM = 3e-4
-"""Of all tests of a recording together, at most: one test for each axis and bin
-has this over their number (Bonferroni). White noise raises the alarm a third as
-often (simulated at 0.01 and 0.03), as a line has to stand out from the bins
-beside it too."""
+"""Probability of a false alarm for all tests of a recording together: one test for
+each axis and bin has this over their number (Bonferroni). White noise raises a third
+of these alarms (simulated at 0.01 and 0.03), since a line also has to exceed its
+neighbouring bins."""
 OUTLYING = 4.0
-"""Standard deviations above the noise beside a band: bins beyond hold a line of
-their own."""
+"""Standard deviations above the noise next to a band, beyond which bins hold another
+line."""
 STRONG = 4.0  # over the median level: a machine was on, or somebody knocked
 KNOCK = 12.0
-"""Segments this much louder than most are left out, and bins of a single one
-count no more than this: knocks."""
+"""Factor over the level of most segments beyond which a segment is excluded, and
+largest weight of a single bin: knocks."""
 WIDEST = 0.125
 """Share of the sampling rate that the band of a folded line may cover."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """Bins (b,) about the frequency ``at_hz`` at which a line of ``source_hz``
-    shows, ``folded`` where as an alias.
+    """Bins (b,) about the frequency ``at_hz`` at which a line of ``source_hz`` shows,
+    as an alias where ``folded``.
 
-    ``inside`` (b,) may hold the line, ``flank`` (b,) tell the noise.
+    ``inside`` (b,) may hold the line, ``flank`` (b,) shows the noise.
     """
 
     source_hz: float
@@ -89,15 +85,15 @@ class Line:
 
 
 def bands(rate_hz: float, size: int) -> list[Band]:
-    """Where the lines of the mains may show in segments of ``size`` samples. A
-    folded harmonic could be anything and is not among them; nor is what folds
-    to the slow noise at the bottom of the spectrum.
-    """
+    """Bands in which the mains may show in segments of ``size`` samples. Aliased
+    harmonics are ambiguous and omitted, as are aliases in the slow noise at the
+    bottom of the spectrum."""
     top, bin_hz = size // 2, rate_hz / size
     found: list[Band] = []
     for harmonic in HARMONICS:
         for mains in MAINS_HZ:
             source = mains * harmonic
+            # Frequency of the alias, and the bins that the line may reach.
             at = abs(source - rate_hz * round(source / rate_hz))
             folded = source > rate_hz / 2 * (1 + TOLERANCE / 2)
             reach = TOLERANCE * source
@@ -115,8 +111,8 @@ def bands(rate_hz: float, size: int) -> list[Band]:
 
 @dataclass
 class Spectra:
-    """Power of segments of the stream, in the bins of `bands`; of one in
-    ``every`` of them. Fed chunks in order."""
+    """Power of segments of the stream in the bins of `bands`, of one in ``every`` of
+    them. Fed chunks in order."""
 
     period_ns: float
     size: int = 0
@@ -151,8 +147,8 @@ class Spectra:
         self._held_ns, self._held = times[at:].copy(), held[:, at:].copy()
 
     def _take(self, time_ns: Ints, u: Floats) -> None:
-        """One at a time, so that the figures do not depend on how many come at
-        once."""
+        """Take one segment at a time, so that results do not depend on the size of
+        the blocks."""
         self._count += 1
         if (self._count - 1) % self.every:
             return
@@ -167,7 +163,7 @@ class Spectra:
         self._end_ns.append(int(time_ns[-1]))
 
     def lines(self, holds: StillIntervals) -> list[Line]:
-        """The lines of the mains in the segments that lie in still spans."""
+        """The mains lines in the segments that lie in still spans."""
         if not self._power:
             return []
         still = holds.within(np.array(self._start_ns), np.array(self._end_ns)) >= 0
@@ -185,10 +181,11 @@ class Spectra:
         return found
 
     def _judged(self, band: Band, power: Floats, alarm: float) -> Line | None:
-        """``power`` (m,3,b)."""
+        """The line of a band from the ``power`` (m,3,b) of m segments, or None."""
         amplitude, places, least = np.zeros(3), np.zeros(3), 1.0
         bin_hz = 1e9 / self.period_ns / self.size
         for axis in range(3):
+            # Segments with a usual level; ratio of their mean spectrum to that level.
             level = np.median(power[:, axis, band.flank], axis=1)
             sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < STRONG * np.median(level))
             if sound.sum() < SEGMENTS_LEAST:
@@ -198,6 +195,8 @@ class Spectra:
             usual = float(np.mean(level[sound]))
             ratios = power[sound, axis] / usual
             ratio, clipped = ratios.mean(axis=0), np.minimum(ratios, KNOCK).mean(axis=0)
+            # Test of the highest bin, interpolation of its frequency, amplitude from
+            # its excess.
             peak, p_value, floor = _peak(band, ratio, clipped, int(sound.sum()), self.size // 2)
             if peak < 0 or p_value > alarm:
                 continue
@@ -214,10 +213,9 @@ class Spectra:
 
 
 def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -> tuple[int, float, Floats]:
-    """The highest bin inside the band, or -1 where it is the skirt of a line
-    outside; the probability that noise raises it so, by the means without
-    knocks; and the noise (b,), smooth over the flanks.
-    """
+    """The highest bin inside the band, or -1 where it is the skirt of a line outside;
+    the probability of such a height by noise, from means without knocks; and the
+    noise (b,), smooth over the flanks."""
     x = np.log(band.bins / band.bins.mean())
     log = np.log(np.maximum(clipped, 1e-300))
     used = band.flank.copy()
@@ -225,6 +223,7 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
     expected = 1 / np.sqrt(independent)
     order = 2 if band.bins[-1] < top and (band.bins > band.bins[band.inside][-1]).sum() >= FLANK else 1
     for _ in range(4):
+        # Robust polynomial fit of the log power over the flanks.
         fitted = np.polyval(np.polyfit(x[used], log[used], order), x)
         off = log - fitted
         spread = max(expected, 1.4826 * float(np.median(np.abs(off[used]))))
@@ -233,6 +232,7 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
             break
         used = kept
     spread = max(expected, float(np.sqrt(np.mean(off[used] ** 2) * used.sum() / (used.sum() - order - 1))))
+    # The highest bin must exceed its neighbours.
     candidates = np.flatnonzero(band.inside)
     peak = int(candidates[np.argmax(ratio[candidates])])
     about = ratio[max(peak - 2, 0) : peak + 3]
@@ -251,14 +251,14 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
 
 def _raised(excess: float, shape: float, bins: float) -> float:
     """Probability that noise of ``shape`` degrees of freedom raises a bin by
-    ``excess`` above a level from ``bins``."""
+    ``excess`` above a level from ``bins`` bins."""
     held = shape / (1 + 1 / bins)
     return float(gamma_sf(excess * held, held))
 
 
 def _offset(excess: Floats, peak: int) -> float:
-    """Of a line from the bin at its peak, in bins: by the ratio of the
-    amplitudes beside it, through a Hann window."""
+    """Offset of a line from its peak bin, in bins, by the ratio of the neighbouring
+    amplitudes through a Hann window."""
     neighbours = [excess[i] if 0 <= i < len(excess) else 0.0 for i in (peak - 1, peak + 1)]
     up = neighbours[1] > neighbours[0]
     share = float(np.sqrt(max(neighbours[int(up)], 0.0) / max(excess[peak], 1e-300)))
