@@ -44,6 +44,9 @@ from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
+CONTAINERS_MOST = 400_000
+"""Lists and objects of a JSON document: one of a thousand poses has some 20,000,
+and each takes 70 bytes and more."""
 PROFILE = PROFILE_FILE
 UNKNOWN_NOISE = "unknown_noise"
 
@@ -304,6 +307,8 @@ def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
     the line at fault, or with what the data are where they are of another
     kind."""
     _require_no_other_kind(data, where)
+    if data.count(b"[") + data.count(b"{") > CONTAINERS_MOST:
+        raise InputError(f"{where}: more than {CONTAINERS_MOST} lists and objects, expected a JSON document")
     try:
         text = data.decode()
         document = json.loads(text, object_pairs_hook=_each_key_once)

@@ -13,6 +13,9 @@ _LIBRARIES_BYTES, _THREAD_BYTES = 224 * 2**20, 48 * 2**20
 """Address space that numpy, scipy and what else a command loads take, and each
 thread of linear algebra with its buffer and stack, of numpy and of scipy."""
 _DEPTH = 20  # of errors that others caused
+_ROOM_BYTES = 32 * 2**20
+"""A library that is loaded with less address space left may fail with any error:
+matplotlib ends with an IndexError where an allocation inside `re` failed."""
 
 
 def ran_out_of_memory(e: BaseException | None) -> bool:
@@ -41,16 +44,23 @@ def _says_so(e: BaseException) -> bool:
             return False
 
 
+def no_room_left() -> bool:
+    """Whether a limit of the address space (``ulimit -v``) is all but used up."""
+    if _limit() is None:
+        return False
+    try:
+        mmap.mmap(-1, _ROOM_BYTES).close()
+    except OSError:
+        return True
+    return False
+
+
 def require_address_space() -> None:
     """Before the libraries are loaded, where a limit (``ulimit -v``) is set:
     OpenBLAS that finds no room for its buffers ends the process with 1, or
     tries again for a quarter of an hour. Raises MemoryError."""
-    try:
-        import resource  # which Windows has not
-    except ImportError:
-        return
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit == resource.RLIM_INFINITY:
+    limit = _limit()
+    if limit is None:
         return
     wanted = _LIBRARIES_BYTES + _THREAD_BYTES * _threads()
     try:
@@ -60,6 +70,16 @@ def require_address_space() -> None:
             f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for the {wanted >> 20} MiB"
             " of the libraries"
         ) from None
+
+
+def _limit() -> int | None:
+    """Of the address space, in bytes; None where there is none."""
+    try:
+        import resource  # which Windows has not
+    except ImportError:
+        return None
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def _threads() -> int:

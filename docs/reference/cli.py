@@ -47,7 +47,7 @@ A result (`-o`, `--report`, the files of `run`) is written whole or not at all, 
 
 ## Input
 
-`REC` is a recording (`.mcap`, or the manifest `.segments.json` of one in [segments](recording.md#segments)), or a [table](tables.md): text with separators, Parquet, or `-` for text on standard input. A table that can be read in two ways is an error that names the option to settle it. Input that is nested, long or packed beyond honest use is an error before it takes time or memory ([profile](profile.md#bounds), [recording](recording.md#bounds)). A JSON document has at most 4 MiB and each key once. A file of another kind is named by its content.
+`REC` is a recording (`.mcap`, or the manifest `.segments.json` of one in [segments](recording.md#segments)), or a [table](tables.md): text with separators, Parquet, or `-` for text on standard input. A table that can be read in two ways is an error that names the option to settle it. Input that is nested, long or packed beyond honest use is an error before it takes time or memory ([profile](profile.md#bounds), [recording](recording.md#bounds)). A JSON document has at most 4 MiB and 400,000 lists and objects, and each key once. A file of another kind is named by its content.
 
 Poses are labelled by the side that is up: `+X`, `-X+Y` between two sides, `+X+Y+Z` a corner; `N1`, `N2` … are other directions of a plan. Up is the direction of the specific force at rest.
 

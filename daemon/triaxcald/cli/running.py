@@ -12,7 +12,7 @@ from triaxcal_drivers.loading import lacking
 from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, DaemonError, exit_code_of, severest
-from triaxcald.memory import out_of_memory, ran_out_of_memory
+from triaxcald.memory import no_room_left, out_of_memory, ran_out_of_memory
 
 
 def run(check: Callable[[], None], work: Callable[[], int]) -> int:
@@ -20,7 +20,7 @@ def run(check: Callable[[], None], work: Callable[[], int]) -> int:
     try:
         return _run(check, work)
     except Exception as e:
-        if not ran_out_of_memory(e):
+        if not ran_out_of_memory(e) and not no_room_left():
             raise
         e.__traceback__ = e.__context__ = None  # and all that its frames hold
         say(f"triaxcal: {out_of_memory(e)}")

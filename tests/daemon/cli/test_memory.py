@@ -113,6 +113,33 @@ def test_a_recording_whose_writer_has_no_memory_is_sound_up_to_a_time(
     assert capsys.readouterr().err == ""
 
 
+FULL = """
+import mmap, resource, sys
+from triaxcald.cli.running import run
+
+def work():
+    if {limited}:
+        resource.setrlimit(resource.RLIMIT_AS, (600 << 20, 600 << 20))
+        try:
+            while True:
+                held.append(mmap.mmap(-1, 16 << 20))
+        except OSError:
+            pass
+    raise IndexError("no such group")
+
+held = []
+sys.exit(run(lambda: None, work))
+"""
+
+
+@pytest.mark.parametrize(("full", "code"), [(True, 5), (False, 1)])
+def test_any_error_without_room_for_a_library_is_that_memory_ran_out(full: bool, code: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FULL.format(limited=full)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "Traceback" in done.stderr, "memory ran out" in done.stderr) == (code, not full, full)
+
+
 def limited(mib: int, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """A command with so much address space, and one thread of linear algebra."""
     limit = mib * 2**20
