@@ -21,10 +21,10 @@ from mcap.writer import Writer as McapWriter
 from benchmarks.fuzz_spoil import spoil, spoil_packed
 from triaxcal.model.directions import directions
 from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.layout import stream_layout
+from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import CanProfile, CanStream, PdoStream
+from triaxcal_drivers.catalogue import BUILT_IN, load_bundle
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import BUILT_IN, load_bundle
 from triaxcald.cli.commands import main as command
 from triaxcald.recording import schema
 from triaxcald.recording.reader import Recording

@@ -21,8 +21,8 @@ import numpy as np
 
 from benchmarks.table import Table
 from triaxcal.arrays import Floats, Ints
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import BUILT_IN
 from triaxcald.inputs import PROFILE
 from triaxcald.recording.writer import RecordingWriter
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import can
 
 from benchmarks.table import Table
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.recording.reader import Recording
 from triaxcald.station.lock import FOLDER_VARIABLE
 

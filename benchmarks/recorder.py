@@ -20,8 +20,8 @@ import numpy as np
 from mcap.writer import Writer as McapWriter
 
 from benchmarks.table import Table, chosen
+from triaxcal_drivers.catalogue import BUILT_IN, driver_named
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import BUILT_IN, driver_named
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.inputs import bundle_of
 from triaxcald.recording.python_can import (

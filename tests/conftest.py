@@ -130,7 +130,7 @@ class Workshop:
 
     def impatient_profile(self, name: str = "triax-ref-modbus") -> str:
         """A copy of a built-in profile, beside the station file, that waits for a reply no longer than it must."""
-        from triaxcal_drivers.loading import BUILT_IN
+        from triaxcal_drivers.catalogue import BUILT_IN
 
         text = (BUILT_IN / f"{name}.toml").read_text()
         lines = [line for line in text.splitlines() if not line.startswith(("silence_timeout_s", "reply_timeout_s"))]

@@ -23,7 +23,7 @@ import pytest
 from pydantic import BaseModel
 
 import triaxcal as tc
-from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcald.cli.commands import main, parser
 from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording

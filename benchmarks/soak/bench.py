@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 
 GROUP = "239.74.163.2"
 BAUDRATE = 460_800

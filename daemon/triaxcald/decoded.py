@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from triaxcal.arrays import READING_MOST
 from triaxcal.number_format import number_of
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.loading import driver_named
 from triaxcal_drivers.profile import Bundle
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")

@@ -24,9 +24,9 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.stillness.windows import Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.files import TooLarge, read_whole, special_kind
-from triaxcal_drivers.loading import parse_bundle
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald import text
 from triaxcald.decoded import DecodedStream

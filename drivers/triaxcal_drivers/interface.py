@@ -3,96 +3,22 @@ or in a recording.
 
 A driver is code for one transport. It validates its own part of a profile,
 opens devices, and makes decoders. A decoder is pure: raw batches in, samples
-out, no I/O, the same from a live bus and from a recording."""
+out, no I/O, the same from a live bus and from a recording.
+"""
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
-from collections.abc import AsyncIterator, Hashable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from triaxcal_drivers.profile import Bundle, Profile
-
-# Counts answers against requests, so that an answer too many shows: two units have
-# one address, or another program asks the same unit. No I/O.
-
-KeyT = TypeVar("KeyT", bound=Hashable)
-
-OPEN_MOST = 2
-"""Requests without an answer that are remembered for each key: as many late
-answers explain themselves. A lost request explains one answer too many."""
-KEYS_MOST = 512
-"""Keys that are remembered, and answers too many that wait to be taken. A
-device has fewer registers."""
-
-
-@dataclass(frozen=True)
-class ExtraAnswer:
-    """An answer that no request explains. ``register`` is the profile's name of
-    what was asked for, empty if that is unknown; ``answer`` came too many, and
-    ``first`` is what had answered the request, None if nobody had asked. Raw
-    register bytes of a read, else what came on the wire."""
-
-    register: str
-    answer: bytes
-    first: bytes | None
-
-    @property
-    def same(self) -> bool:
-        """Whether an answer came twice, byte for byte, as a line may double it.
-        Else one unit alone cannot have sent both."""
-        return self.first == self.answer
-
-
-@dataclass(frozen=True)
-class Extra(Generic[KeyT]):
-    """As `ExtraAnswer`, as it came on the wire."""
-
-    key: KeyT
-    answer: bytes
-    first: bytes | None
-
-
-class Answers(Generic[KeyT]):
-    """Requests and answers that belong together have one key."""
-
-    def __init__(self) -> None:
-        self._open: Counter[KeyT] = Counter()
-        self._last: OrderedDict[KeyT, bytes] = OrderedDict()
-        self._extra: list[Extra[KeyT]] = []
-
-    def asked(self, key: KeyT) -> None:
-        self._open[key] = min(self._open[key] + 1, OPEN_MOST)
-
-        while len(self._open) > 2 * KEYS_MOST:  # requests that nothing ever answered
-            del self._open[next(iter(self._open))]
-
-    def answered(self, key: KeyT, answer: bytes, *, final: bool = True) -> None:
-        """``final``: no other answer to the same request is to come, as one may
-        after "busy"."""
-        if self._open[key] > 0:
-            self._open[key] -= final
-            self._last[key] = answer
-            self._last.move_to_end(key)
-            while len(self._last) > KEYS_MOST:
-                old, _ = self._last.popitem(last=False)
-                del self._open[old]
-        elif len(self._extra) < KEYS_MOST:
-            self._extra.append(Extra(key, answer, self._last.get(key)))
-
-    def was_asked(self, key: KeyT) -> bool:
-        return key in self._last or self._open[key] > 0
-
-    def take(self) -> list[Extra[KeyT]]:
-        """The answers too many since the last call."""
-        taken, self._extra = self._extra, []
-        return taken
+from triaxcal_drivers.two_senders import ExtraAnswer
 
 
 class RawFlag(IntFlag):
@@ -334,7 +260,7 @@ class Driver(Protocol):
     it imports only when a device is opened, so that `triaxcal devices` can say
     which are not there. By a method ``loads(bundle, bus)`` it may say what each
     stream takes of a line on which units are asked in turn
-    (`triaxcal_drivers.interface.LineLoad`, by stream).
+    (`LineLoad`, by stream).
     """
 
     profile_model: type[Profile]
@@ -348,15 +274,14 @@ class Driver(Protocol):
         names."""
 
 
-# What a unit takes of a line that it shares: the arithmetic of whether the line can
-# carry its units.
-
-
 @dataclass(frozen=True)
 class LineLoad:
-    """``line`` names what units share, ``settings`` how it is driven, which
+    """What a unit takes of a line that it shares.
+
+    ``line`` names what units share, ``settings`` how it is driven, which
     must be the same for all of them. A unit's stream takes ``reads_per_s``
-    reads, or frames, each of which keeps the line for ``read_s`` at least."""
+    reads, or frames, each of which keeps the line for ``read_s`` at least.
+    """
 
     line: str
     settings: str

@@ -17,11 +17,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.nearest import nearest
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.registers import RawType
+from triaxcal_drivers.roles import AXES
 
-AXES = ("x", "y", "z")
 READINGS, CORRECTED = "readings", "corrected"
+READING_CHANNELS = tuple("u" + axis for axis in AXES)
+"""A stream has these, and further ones by any names."""
 STREAMS_MOST, CHANNELS_MOST = 16, 256  # ours have two of six channels; a Modbus reply has room for 125
 STEPS_MOST = 100  # of a sequence; ours have at most three
 SCALE_FACTOR_RATIO = 4.0
@@ -33,6 +35,14 @@ class Strict(BaseModel):
     """No unknown keys, no later changes, no numbers read out of text."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+def require_readings(channels: Mapping[str, object]) -> None:
+    """Raises ValueError with the first of `READING_CHANNELS` that is not
+    there."""
+    for name in READING_CHANNELS:
+        if name not in channels:
+            raise ValueError(f"channels.{name} is missing")
 
 
 class Identity(Strict):

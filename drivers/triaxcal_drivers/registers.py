@@ -1,5 +1,10 @@
-"""Numbers to raw register bytes and back, and what the register's format costs.
-No I/O."""
+"""Numbers to raw bytes and back: the types of raw numbers that a register, or a
+field of a stream, holds, and what a register's format costs.
+
+`TYPES` is the one table of types. What a profile may declare, its JSON Schema,
+the bytes written and read, the samples decoded and the page of the reference
+all come from it. The types' bytes are most significant first. No I/O.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.errors import RegisterValueError
-
-# The types of raw numbers: how a register or a field of a stream holds a number in
-# bytes.
 
 WORD = 2
 """Bytes of a Modbus register."""

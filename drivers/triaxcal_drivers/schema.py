@@ -6,8 +6,8 @@ from __future__ import annotations
 import json
 import sys
 
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverMissing
-from triaxcal_drivers.loading import driver_named
 
 
 def schema(driver: str) -> str:

@@ -1,20 +1,24 @@
-"""Whether the records of one stream come from two units that send side by side.
+"""Whether two units send side by side: by the records of a stream, and by answers
+that no request explains. No I/O; all that is said follows from records and
+answers alone.
 
-Two units with one identifier, or one address, mix two sequences of counts. Each
-goes on by one at the unit's own rate, so that there are twice as many records
-as either sequence has counts. One unit that loses, repeats, delays or reorders
-records, or restarts, does neither: its repeats are equal in content, its delayed
-records lack in the sequence that they are not in, and after a restart the old
-sequence does not go on.
+**Records.** Two units with one identifier, or one address, mix two sequences of
+counts. Each goes on by one at the unit's own rate, so that there are twice as
+many records as either sequence has counts. One unit that loses, repeats, delays
+or reorders records, or restarts, does neither: its repeats are equal in content,
+its delayed records lack in the sequence that they are not in, and after a
+restart the old sequence does not go on.
 
-No I/O; all that is said follows from the records alone.
+**Answers.** They are counted against requests: one too many shows that two units
+have one address, or that another program asks the same unit.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -351,3 +355,76 @@ class Senders:
             mine = np.flatnonzero(message == number)[-MEMORY:]
             found.append(Records(time_ns[mine], counter[mine], values[mine], self._counts))
         return found
+
+
+KeyT = TypeVar("KeyT", bound=Hashable)
+
+OPEN_MOST = 2
+"""Requests without an answer that are remembered for each key: as many late
+answers explain themselves. A lost request explains one answer too many."""
+KEYS_MOST = 512
+"""Keys that are remembered, and answers too many that wait to be taken. A
+device has fewer registers."""
+
+
+@dataclass(frozen=True)
+class ExtraAnswer:
+    """An answer that no request explains. ``register`` is the profile's name of
+    what was asked for, empty if that is unknown; ``answer`` came too many, and
+    ``first`` is what had answered the request, None if nobody had asked. Raw
+    register bytes of a read, else what came on the wire."""
+
+    register: str
+    answer: bytes
+    first: bytes | None
+
+    @property
+    def same(self) -> bool:
+        """Whether an answer came twice, byte for byte, as a line may double it.
+        Else one unit alone cannot have sent both."""
+        return self.first == self.answer
+
+
+@dataclass(frozen=True)
+class Extra(Generic[KeyT]):
+    """As `ExtraAnswer`, as it came on the wire."""
+
+    key: KeyT
+    answer: bytes
+    first: bytes | None
+
+
+class Answers(Generic[KeyT]):
+    """Requests and answers that belong together have one key."""
+
+    def __init__(self) -> None:
+        self._open: Counter[KeyT] = Counter()
+        self._last: OrderedDict[KeyT, bytes] = OrderedDict()
+        self._extra: list[Extra[KeyT]] = []
+
+    def asked(self, key: KeyT) -> None:
+        self._open[key] = min(self._open[key] + 1, OPEN_MOST)
+
+        while len(self._open) > 2 * KEYS_MOST:  # requests that nothing ever answered
+            del self._open[next(iter(self._open))]
+
+    def answered(self, key: KeyT, answer: bytes, *, final: bool = True) -> None:
+        """``final``: no other answer to the same request is to come, as one may
+        after "busy"."""
+        if self._open[key] > 0:
+            self._open[key] -= final
+            self._last[key] = answer
+            self._last.move_to_end(key)
+            while len(self._last) > KEYS_MOST:
+                old, _ = self._last.popitem(last=False)
+                del self._open[old]
+        elif len(self._extra) < KEYS_MOST:
+            self._extra.append(Extra(key, answer, self._last.get(key)))
+
+    def was_asked(self, key: KeyT) -> bool:
+        return key in self._last or self._open[key] > 0
+
+    def take(self) -> list[Extra[KeyT]]:
+        """The answers too many since the last call."""
+        taken, self._extra = self._extra, []
+        return taken

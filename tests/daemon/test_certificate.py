@@ -12,8 +12,8 @@ import pytest
 
 from triaxcal.errors import Refused
 from triaxcal.interchange.calibration_reading import calibration_of
+from triaxcal_drivers.catalogue import BUILT_IN, parse_bundle
 from triaxcal_drivers.errors import RegisterValueError
-from triaxcal_drivers.loading import BUILT_IN, parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcald.certificate import Certified, certify, held_by_device, roles
 from triaxcald.documents import to_text

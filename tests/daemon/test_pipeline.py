@@ -11,8 +11,8 @@ import pytest
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import QualityDetector, QualityFinding
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
+from triaxcal_drivers.catalogue import load_bundle, parse_bundle
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite

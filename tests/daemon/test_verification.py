@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.poses.pose import Pose
-from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.profile import CORRECTED
 from triaxcald.pipeline import Pipeline
 from triaxcald.verification import Apart, verification_document, verified, verify

@@ -11,8 +11,8 @@ from tests.devices import canopen
 from tests.devices.habits import Habits
 from tests.devices.profiles import DBC_FILE, Driver, Timing, Wording, dbc_text, profile_text
 from tests.devices.table import NEW, registers_of
+from triaxcal_drivers.catalogue import driver_named, parse_bundle
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import driver_named, parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 EVERYTHING = Habits(counter=True, mirror=True, date=True, number="int32")

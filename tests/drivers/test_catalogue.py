@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from triaxcal_drivers.catalogue import driver_named, listed
 from triaxcal_drivers.errors import DriverMissing
-from triaxcal_drivers.loading import driver_named, listed
 from triaxcal_drivers.modbus.driver import ModbusDriver
 
 DRIVER = """
@@ -67,7 +67,7 @@ def test_a_driver_installed_by_somebody_else_is_found(elsewhere):
     elsewhere("their_drivers", DRIVER, "their-serial = their_drivers:SerialDriver")
     found = json.loads(
         elsewhere.python(
-            "import json; from triaxcal_drivers.loading import listed;"
+            "import json; from triaxcal_drivers.catalogue import listed;"
             "print(json.dumps([[d.name, d.target, d.distribution, d.fault] for d in listed()]))"
         )
     )
@@ -78,7 +78,7 @@ def test_a_driver_installed_by_somebody_else_is_found(elsewhere):
 def test_a_profile_for_it_is_read_by_it(elsewhere):
     elsewhere("their_drivers", DRIVER, "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(
-        "from triaxcal_drivers.loading import parse_bundle\n"
+        "from triaxcal_drivers.catalogue import parse_bundle\n"
         f"bundle = parse_bundle({PROFILE.encode()!r}, None, where='p')\n"
         "print(type(bundle.profile).__name__, bundle.profile.letters)"
     )
@@ -98,7 +98,7 @@ def test_a_driver_that_does_not_load_is_listed_with_the_reason(elsewhere, module
     elsewhere("their_drivers", module, "their-serial = their_drivers:SerialDriver")
     found = json.loads(
         elsewhere.python(
-            "import json; from triaxcal_drivers.loading import listed;"
+            "import json; from triaxcal_drivers.catalogue import listed;"
             "print(json.dumps({d.name: d.fault for d in listed()}))"
         )
     )
@@ -113,7 +113,7 @@ def test_a_driver_whose_packages_are_not_there_is_listed_with_what_brings_them(e
     assert lacking != DRIVER
     elsewhere("their_drivers", lacking, "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(
-        "from triaxcal_drivers.loading import listed; from triaxcal_drivers.loading import EXTRAS, absent\n"
+        "from triaxcal_drivers.catalogue import listed; from triaxcal_drivers.hints import EXTRAS, absent\n"
         "print({d.name: d.fault for d in listed()}['their-serial']); EXTRAS['no_such_module'] = 'can'\n"
         "print(absent(['no_such_module']))"
     )
@@ -137,7 +137,7 @@ def test_a_driver_names_no_package_that_opening_a_device_does_not_import(elsewhe
 def test_asking_for_one_driver_imports_no_other(elsewhere):
     elsewhere("their_drivers", "raise RuntimeError", "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(
-        "import sys; from triaxcal_drivers.loading import driver_named\n"
+        "import sys; from triaxcal_drivers.catalogue import driver_named\n"
         "print('triaxcal_drivers.modbus.driver' in sys.modules, end=' ')\n"
         "driver_named('modbus')\n"
         "print('triaxcal_drivers.modbus.driver' in sys.modules, 'can' in sys.modules)"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from triaxcal_drivers.catalogue import BUILT_IN, load_bundle, parse_bundle
 from triaxcal_drivers.errors import DriverMissing, ProfileError
-from triaxcal_drivers.loading import BUILT_IN, load_bundle, parse_bundle
 from triaxcal_drivers.profile import Bundle, PollStep, WriteStep
 
 GOOD = """\

@@ -11,7 +11,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
@@ -19,7 +19,7 @@ REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 @pytest.mark.parametrize("driver", ["can", "modbus"])
 def test_the_committed_schema_is_what_the_command_prints(driver):
     printed = subprocess.run(
-        [sys.executable, "-m", "triaxcal_drivers.loading", driver], capture_output=True, check=True, timeout=30
+        [sys.executable, "-m", "triaxcal_drivers.schema", driver], capture_output=True, check=True, timeout=30
     ).stdout
     committed = json.loads((REFERENCE / f"profile-{driver}.schema.json").read_bytes())
     assert json.loads(printed) == committed, "the schema is stale; run make docs"
@@ -49,7 +49,7 @@ def test_built_in_profiles_fit_the_schema_of_their_driver(path):
 
 def test_an_unknown_driver_is_named_and_nothing_printed():
     done = subprocess.run(
-        [sys.executable, "-m", "triaxcal_drivers.loading", "modbuss"], capture_output=True, text=True, timeout=30
+        [sys.executable, "-m", "triaxcal_drivers.schema", "modbuss"], capture_output=True, text=True, timeout=30
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "no driver named 'modbuss'; did you mean 'modbus'?\n"

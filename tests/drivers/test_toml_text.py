@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.loading import BUILT_IN
-from triaxcal_drivers.validation import DEPTH_MOST, PARTS_MOST, SIZE_MOST, parse_toml
+from triaxcal_drivers.toml_text import DEPTH_MOST, PARTS_MOST, SIZE_MOST, parse_toml
 
 
 def refusal(text: str) -> str:

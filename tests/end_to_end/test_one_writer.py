@@ -56,7 +56,7 @@ def _hesitating(served: Any) -> Iterator[tuple[threading.Event, threading.Event]
 
 def _patient_profile(workshop: Any) -> str:
     """Waits for a reply as long as a test may take."""
-    from triaxcal_drivers.loading import BUILT_IN
+    from triaxcal_drivers.catalogue import BUILT_IN
 
     text = (BUILT_IN / "triax-ref-modbus.toml").read_text()
     assert "[sampling]\n" in text

@@ -12,8 +12,8 @@ from benchmarks.soak.account import Account, account, manifest_faults, replayed
 from benchmarks.soak.bench import units_of
 from benchmarks.soak.faults import QUIET_S, schedule
 from benchmarks.soak.units import SENT, WhiteNoise, rows
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.interface import Gap, RawBatch
-from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, PROFILE
 from triaxcald.recording.segments import SegmentedWriter

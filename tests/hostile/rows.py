@@ -15,7 +15,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from tests.hostile.mcap_bytes import attachment, channel, chunk, message, metadata, raw, record, whole
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.recording import schema
 
 RECORDING = Path(__file__).parents[2] / "recordings" / "can-second-order.mcap"

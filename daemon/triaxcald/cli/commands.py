@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
-from triaxcal_drivers.nearest import closest
+from triaxcal_drivers.hints import closest
 from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
 

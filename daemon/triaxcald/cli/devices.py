@@ -10,8 +10,8 @@ from typing import Any
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.plugins import package_of, plugins
 from triaxcal.rounding import REGISTER_DIGITS, number
+from triaxcal_drivers.catalogue import BUILT_IN, listed, load_bundle
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
-from triaxcal_drivers.loading import BUILT_IN, listed, load_bundle
 from triaxcald import text
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible

@@ -17,7 +17,7 @@ from triaxcal.number_format import number_of
 from triaxcal.rounding import concise, number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
-from triaxcal_drivers.loading import absent
+from triaxcal_drivers.hints import absent
 from triaxcald import text
 from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from triaxcal.number_format import number_of
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.logs.kinds import Kind, opened
 from triaxcald.cli.console import at, emit, say, show
 from triaxcald.cli.syntax import writable

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from triaxcal.errors import Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, RegisterValueError
-from triaxcal_drivers.loading import lacking
+from triaxcal_drivers.hints import lacking
 from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, DaemonError, exit_code_of, severest

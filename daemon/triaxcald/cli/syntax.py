@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from triaxcal.model.gravity import HEIGHTS_M
 from triaxcal.model.samples import Moment
-from triaxcal_drivers.nearest import closest
+from triaxcal_drivers.hints import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable

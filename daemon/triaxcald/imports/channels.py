@@ -8,8 +8,8 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from triaxcal.number_format import number_of
+from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.mcap.container import Channel
-from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 
 SHOWN = 8  # channels in a message

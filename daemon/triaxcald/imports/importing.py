@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import Decoder, RawBatch
-from triaxcal_drivers.loading import driver_named
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.decoded import only_finite
 from triaxcald.errors import InputError

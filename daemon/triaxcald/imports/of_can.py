@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from triaxcal.number_format import number_of
-from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
+from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.can.model import CanProfile
+from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import EXTENDED, LONGEST_NS, Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
-from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports import text

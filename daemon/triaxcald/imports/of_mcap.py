@@ -10,12 +10,12 @@ from typing import Any, cast
 
 from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import LogError
+from triaxcal_drivers.hints import clipped, nearest
 from triaxcal_drivers.logs.frames import LONGEST_NS, Account
 from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
 from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
 from triaxcal_drivers.mcap.driver import McapProfile, schema_file, stream_reader
-from triaxcal_drivers.mcap.schema import MessageSchema
-from triaxcal_drivers.nearest import clipped, nearest
+from triaxcal_drivers.mcap.messages import MessageSchema
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports import text

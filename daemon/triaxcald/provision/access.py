@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
-from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, ExtraAnswer, RawBatch
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
 from triaxcal_drivers.profile import Profile, WriteStep
+from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import DaemonError, TwoAnswer
 
 # How time passes while a device is written to, so that tests need not wait.

@@ -8,9 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.interface import Device, ExtraAnswer
+from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcal_drivers.registers import TYPES
+from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.sequence import probe

@@ -20,10 +20,10 @@ from triaxcal.model.directions import directions, elsewhere
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import COVARIATES, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
-from triaxcal_drivers.loading import driver_named, load_bundle
+from triaxcal_drivers.catalogue import driver_named, load_bundle
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.profile import Bundle, Strict
-from triaxcal_drivers.validation import DEVICE, parse_toml, read_toml, validate
+from triaxcal_drivers.toml_text import DEVICE, parse_toml, read_toml, validate
 from triaxcald.errors import InputError
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit

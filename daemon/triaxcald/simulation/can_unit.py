@@ -18,12 +18,12 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.layout import object_dictionary
+from triaxcal_drivers.can.description import object_dictionary
 from triaxcal_drivers.can.line import opened
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.can.python_can import open_python_can
+from triaxcal_drivers.catalogue import BUILT_IN, load_bundle
 from triaxcal_drivers.errors import BusError
-from triaxcal_drivers.loading import BUILT_IN, load_bundle
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import INVALID_CORRECTED, FaultKind, ReferenceUnit, RegisterFault, SampleRun, UnitSilent
 

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.profile import Strict
-from triaxcal_drivers.validation import validate
+from triaxcal_drivers.toml_text import validate
 from triaxcald.errors import InputError
 from triaxcald.station.coming_back import Patience, claimed, until_open
 

@@ -18,13 +18,13 @@ from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator
 from triaxcal.model.gravity import local_gravity_g
 from triaxcal.model.samples import Moment
 from triaxcal_drivers.can.model import BusSettings
+from triaxcal_drivers.catalogue import driver_named, load_bundle
 from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.loading import driver_named, load_bundle
-from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
-from triaxcal_drivers.validation import STATION, parse_toml, read_toml, validate
+from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml, validate
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for

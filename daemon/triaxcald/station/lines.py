@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from triaxcal_drivers.can.model import BusSettings
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import LineLoad
-from triaxcal_drivers.loading import driver_named
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.errors import InputError
 from triaxcald.station.buses import BusPlace

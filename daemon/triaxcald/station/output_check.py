@@ -11,10 +11,10 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from triaxcal_drivers.attention import Attention
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, RawBatch, SampleBlock
-from triaxcal_drivers.loading import driver_named
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit

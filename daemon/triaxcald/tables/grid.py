@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow
 from triaxcald.tables.arrow import MOSTLY, Column

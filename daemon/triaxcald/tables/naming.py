@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcald.tables import words as known
 
 OUTPUTS = ("ux", "uy", "uz")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal.documents import OUT, UNCERTAINTY
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables.source import blocks, label_of
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.files import document_kind
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import MOSTLY, Column

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal.number_format import plain
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.hints import clipped
 from triaxcald.tables import clock
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.grid import Grid

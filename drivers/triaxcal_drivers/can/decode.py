@@ -1,5 +1,5 @@
-"""Raw CAN records to samples: put together by counter, in order, the same
-however the records are cut."""
+"""Raw CAN records to samples: put together by counter, or in time where no
+counter says so, in order, the same however the records are cut."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.can.layout import NODES, Layout
-from triaxcal_drivers.can.model import READING_CHANNELS
 from triaxcal_drivers.interface import EXTENDED_KEY, RawBatch, RawFlag, SampleBlock
+from triaxcal_drivers.profile import READING_CHANNELS
+from triaxcal_drivers.timeline import signed_steps
 from triaxcal_drivers.two_senders import Senders, by_arrival, by_counter
-
-# Which messages are one sample where no counter says so.
 
 Ints = NDArray[np.int64]
 
@@ -285,8 +284,7 @@ class CanDecoder:
 
     def _unwrap(self, parts: _Parts) -> Ints:
         before = np.concatenate([[self._last_raw], parts.counter[:-1]])
-        half = self._range // 2
-        step = (parts.counter - before + half) % self._range - half
+        step = signed_steps(parts.counter, self._last_raw, self._layout.counter_bits)
         restarted = step < -self._return
         restarted |= (step > self._range // 64) & (parts.counter < self._range // 256)
         pause = np.diff(parts.time_ns, prepend=self._last_ns) / self._period_ns

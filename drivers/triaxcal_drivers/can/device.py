@@ -18,9 +18,8 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
-from triaxcal_drivers.can.line import CanLine, join, leave
+from triaxcal_drivers.can.line import BATCH_FRAMES, CanLine, FrameQueue, join, leave
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
-from triaxcal_drivers.can.receive import BATCH_FRAMES, FrameQueue
 from triaxcal_drivers.errors import (
     BusError,
     DeviceAbsent,
@@ -30,8 +29,9 @@ from triaxcal_drivers.errors import (
     ProfileError,
     RegisterRefused,
 )
-from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Answers, ExtraAnswer, RawBatch, RawFlag
-from triaxcal_drivers.nearest import nearest
+from triaxcal_drivers.hints import nearest
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, RawBatch, RawFlag
+from triaxcal_drivers.two_senders import Answers, ExtraAnswer
 
 T = TypeVar("T")
 

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.can.adapter import Identifier
 from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.layout import Layout, stream_layout
+from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.model import CanBus, CanProfile
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import LineLoad
-from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import Bundle
 
 if TYPE_CHECKING:

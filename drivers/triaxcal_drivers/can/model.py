@@ -1,4 +1,5 @@
-"""A CAN device's profile and the settings of its bus."""
+"""A CAN device's profile, the settings of its bus, and by which of these settings
+processes share it."""
 
 from __future__ import annotations
 
@@ -12,12 +13,9 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers.claim import Claim, canonical_port
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
+from triaxcal_drivers.profile import CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict, require_readings
 from triaxcal_drivers.registers import ByteOrder
-from triaxcal_drivers.validation import validate
-
-# Which settings of python-can's interfaces say which bus it is; the others only say
-# how it is driven.
+from triaxcal_drivers.toml_text import validate
 
 _SERIAL = ("slcan", "serial", "robotell", "seeedstudio")
 """Interfaces whose channel is a serial port."""
@@ -86,7 +84,6 @@ def _address(text: str) -> str:
         return text
 
 
-READING_CHANNELS = tuple("u" + axis for axis in AXES)
 VALUES_MOST = 256  # of a signal that says what is valid; such a signal has a byte at most
 
 ObjectName = Annotated[
@@ -152,12 +149,6 @@ def _named(key: str, channel: type[Strict]) -> BeforeValidator:
     )
 
 
-def _has_readings(channels: Mapping[str, object]) -> None:
-    for name in READING_CHANNELS:
-        if name not in channels:
-            raise ValueError(f"channels.{name} is missing")
-
-
 Together = Annotated[
     Literal["time"] | None,
     Field(description="without a counter: messages that come within half a period of each other are one sample"),
@@ -171,7 +162,7 @@ class _Stream(Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        _has_readings(self.channels)
+        require_readings(self.channels)
         if self.counter is not None and self.together is not None:
             raise ValueError("together is for messages without a counter, and there is one")
         return self
@@ -282,7 +273,7 @@ class SocketCanOptions(Strict):
     interface has it; the names that python-can has mean what they mean there.
 
     ``listen_only`` refuses to send; ``receive_buffer`` is in bytes, by default
-    `triaxcal_drivers.can.raw_socket.BUFFER_S` seconds of a full bus;
+    `triaxcal_drivers.can.socketcan.BUFFER_S` seconds of a full bus;
     ``hardware_timestamps`` takes the adapter's own where it gives any.
     """
 

@@ -1,8 +1,12 @@
 """A CAN bus behind a raw socket of Linux (SocketCAN), with what the kernel
 knows of each frame: its time, whether frames were lost before it, who sent it.
 
-python-can has a receiver for it too; that one asks the kernel for no count of
-what it lost, keeps its small buffer, and makes an object of each frame."""
+From below: the interface as the kernel has it (rtnetlink), an adapter's clock,
+frames as the bytes that the kernel gives and takes, the socket's set-up and its
+errors, reception, the bus. python-can has a receiver for it too; that one asks
+the kernel for no count of what it lost, keeps its small buffer, and makes an
+object of each frame.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,117 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from triaxcal_drivers.can import error_frame
 from triaxcal_drivers.can.adapter import Frame, Identifier
+from triaxcal_drivers.can.error_frame import ControllerState
 from triaxcal_drivers.can.model import SocketCanOptions
-from triaxcal_drivers.can.receive import BUS_OFF, ControllerState
 from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.nearest import nearest
 
-# Times of an adapter's own clock as times of the host.
+_CAN_TYPE = 280  # ARPHRD_CAN
+_FD_BYTES = 72  # a frame's, and so the interface's mtu with CAN FD
+_UP = 1
+
+_NETLINK_HEADER = struct.Struct("=IHHII")  # length, type, flags, sequence, port
+_INTERFACE = struct.Struct("=BxHiII")  # family, type, index, flags, change
+_ATTRIBUTE = struct.Struct("=HH")  # length, type
+_NESTED = 0x3FFF  # without the bits that say nested or of network byte order
+_NEW_LINK, _GET_LINK, _NETLINK_ERROR, _REQUEST = 16, 18, 2, 1
+_NAME, _MTU, _LINK_INFO, _INFO_DATA = 3, 4, 18, 2
+_BIT_TIMING, _STATE, _CONTROL_MODE, _RESTART_MS = 1, 4, 5, 6
+_LISTEN_ONLY = 2
+_REPLY_BYTES = 1 << 16  # a link's attributes take some 2 kB
+_REPLY_S = 1.0  # the kernel answers at once
+
+
+@dataclass(frozen=True)
+class Link:
+    """``state`` and ``bitrate`` (bit/s) are None for an interface without a
+    controller, such as vcan; ``restart_ms`` is how long after bus-off the
+    controller is started again, 0 for never."""
+
+    name: str
+    can: bool
+    up: bool
+    fd: bool
+    state: ControllerState | None = None
+    bitrate: int | None = None
+    listen_only: bool = False
+    restart_ms: int = 0
+
+
+def read_link(name: str) -> Link:
+    """Asks the kernel, some 50 µs. Raises OSError: with ENODEV where there is
+    no such interface."""
+    try:
+        index = socket.if_nametoindex(name)
+    except OSError as e:  # without a number, before Python 3.14
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV)) from e
+    request = _INTERFACE.pack(socket.AF_UNSPEC, 0, index, 0, 0)
+    header = _NETLINK_HEADER.pack(_NETLINK_HEADER.size + len(request), _GET_LINK, _REQUEST, 1, 0)
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE) as netlink:
+        netlink.settimeout(_REPLY_S)
+        netlink.send(header + request)
+        return link_of(netlink.recv(_REPLY_BYTES))
+
+
+def link_of(reply: bytes) -> Link:
+    """Of a message RTM_NEWLINK. Raises OSError where it is an error message."""
+    length, kind, *_ = _NETLINK_HEADER.unpack_from(reply)
+    if kind == _NETLINK_ERROR:
+        (code,) = struct.unpack_from("=i", reply, _NETLINK_HEADER.size)
+        raise OSError(-code, "the kernel does not tell about this interface")
+    if kind != _NEW_LINK:
+        raise OSError(f"the kernel answered with message {kind}, expected {_NEW_LINK}")
+    _, device, _, flags, _ = _INTERFACE.unpack_from(reply, _NETLINK_HEADER.size)
+    about = dict(_attributes(reply[_NETLINK_HEADER.size + _INTERFACE.size : length]))
+    controller = dict(_attributes(dict(_attributes(about.get(_LINK_INFO, b""))).get(_INFO_DATA, b"")))
+    if device != _CAN_TYPE:
+        controller = {}
+    state = controller.get(_STATE)
+    return Link(
+        about.get(_NAME, b"").rstrip(b"\0").decode(),
+        device == _CAN_TYPE,
+        bool(flags & _UP),
+        _number(about.get(_MTU)) >= _FD_BYTES,
+        None if state is None else _state(_number(state)),
+        _number(controller.get(_BIT_TIMING)) or None,
+        bool(_number(controller.get(_CONTROL_MODE), 4) & _LISTEN_ONLY),
+        _number(controller.get(_RESTART_MS)),
+    )
+
+
+def _number(attribute: bytes | None, offset: int = 0) -> int:
+    return 0 if attribute is None else int(struct.unpack_from("=I", attribute, offset)[0])
+
+
+def _state(number: int) -> ControllerState | None:
+    states = list(ControllerState)
+    return states[number] if number < len(states) else None
+
+
+def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
+    at = 0
+    while at + _ATTRIBUTE.size <= len(data):
+        length, kind = _ATTRIBUTE.unpack_from(data, at)
+        if length < _ATTRIBUTE.size:
+            return
+        yield kind & _NESTED, data[at + _ATTRIBUTE.size : at + length]
+        at += (length + 3) & ~3
+
+
+def can_interfaces() -> list[str]:
+    """Names of the CAN interfaces that there are."""
+    return sorted(name for _, name in socket.if_nameindex() if _is_can(name))
+
+
+def _is_can(name: str) -> bool:
+    try:
+        return read_link(name).can
+    except OSError:  # gone meanwhile
+        return False
+
 
 _WINDOW_NS = 10_000_000_000
 """A crystal's 50 ppm drift apart by half a millisecond meanwhile, which is less
@@ -68,9 +175,6 @@ class HardwareClock:
         self._last_ns = self._last_ns if 0 < self._last_ns - time_ns < _LEARNT_NS else time_ns
         return self._last_ns
 
-
-# CAN frames as a raw socket of Linux gives and takes them (linux/can.h,
-# linux/can/raw.h). Bytes and numbers alone, no I/O.
 
 FD_BYTES = 72  # of a CAN FD frame; a classic one has 16
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -140,115 +244,6 @@ def filters_of(identifiers: Collection[Identifier] | None) -> bytes:
     )
 
 
-# A CAN interface of Linux as the kernel has it (rtnetlink): whether it is up, its
-# bit rate, its controller's state.
-
-_CAN_TYPE = 280  # ARPHRD_CAN
-_FD_BYTES = 72  # a frame's, and so the interface's mtu with CAN FD
-_UP = 1
-
-_LINK_HEADER = struct.Struct("=IHHII")  # length, type, flags, sequence, port
-_INTERFACE = struct.Struct("=BxHiII")  # family, type, index, flags, change
-_ATTRIBUTE = struct.Struct("=HH")  # length, type
-_NESTED = 0x3FFF  # without the bits that say nested or of network byte order
-_NEW_LINK, _GET_LINK, _LINK_ERROR, _REQUEST = 16, 18, 2, 1
-_NAME, _MTU, _LINK_INFO, _INFO_DATA = 3, 4, 18, 2
-_BIT_TIMING, _STATE, _CONTROL_MODE, _RESTART_MS = 1, 4, 5, 6
-_LISTEN_ONLY = 2
-_REPLY_BYTES = 1 << 16  # a link's attributes take some 2 kB
-_REPLY_S = 1.0  # the kernel answers at once
-
-
-@dataclass(frozen=True)
-class Link:
-    """``state`` and ``bitrate`` (bit/s) are None for an interface without a
-    controller, such as vcan; ``restart_ms`` is how long after bus-off the
-    controller is started again, 0 for never."""
-
-    name: str
-    can: bool
-    up: bool
-    fd: bool
-    state: ControllerState | None = None
-    bitrate: int | None = None
-    listen_only: bool = False
-    restart_ms: int = 0
-
-
-def read_link(name: str) -> Link:
-    """Asks the kernel, some 50 µs. Raises OSError: with ENODEV where there is
-    no such interface."""
-    try:
-        index = socket.if_nametoindex(name)
-    except OSError as e:  # without a number, before Python 3.14
-        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV)) from e
-    request = _INTERFACE.pack(socket.AF_UNSPEC, 0, index, 0, 0)
-    header = _LINK_HEADER.pack(_LINK_HEADER.size + len(request), _GET_LINK, _REQUEST, 1, 0)
-    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE) as netlink:
-        netlink.settimeout(_REPLY_S)
-        netlink.send(header + request)
-        return link_of(netlink.recv(_REPLY_BYTES))
-
-
-def link_of(reply: bytes) -> Link:
-    """Of a message RTM_NEWLINK. Raises OSError where it is an error message."""
-    length, kind, *_ = _LINK_HEADER.unpack_from(reply)
-    if kind == _LINK_ERROR:
-        (code,) = struct.unpack_from("=i", reply, _LINK_HEADER.size)
-        raise OSError(-code, "the kernel does not tell about this interface")
-    if kind != _NEW_LINK:
-        raise OSError(f"the kernel answered with message {kind}, expected {_NEW_LINK}")
-    _, device, _, flags, _ = _INTERFACE.unpack_from(reply, _LINK_HEADER.size)
-    about = dict(_attributes(reply[_LINK_HEADER.size + _INTERFACE.size : length]))
-    controller = dict(_attributes(dict(_attributes(about.get(_LINK_INFO, b""))).get(_INFO_DATA, b"")))
-    if device != _CAN_TYPE:
-        controller = {}
-    state = controller.get(_STATE)
-    return Link(
-        about.get(_NAME, b"").rstrip(b"\0").decode(),
-        device == _CAN_TYPE,
-        bool(flags & _UP),
-        _number(about.get(_MTU)) >= _FD_BYTES,
-        None if state is None else _state(_number(state)),
-        _number(controller.get(_BIT_TIMING)) or None,
-        bool(_number(controller.get(_CONTROL_MODE), 4) & _LISTEN_ONLY),
-        _number(controller.get(_RESTART_MS)),
-    )
-
-
-def _number(attribute: bytes | None, offset: int = 0) -> int:
-    return 0 if attribute is None else int(struct.unpack_from("=I", attribute, offset)[0])
-
-
-def _state(number: int) -> ControllerState | None:
-    states = list(ControllerState)
-    return states[number] if number < len(states) else None
-
-
-def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while at + _ATTRIBUTE.size <= len(data):
-        length, kind = _ATTRIBUTE.unpack_from(data, at)
-        if length < _ATTRIBUTE.size:
-            return
-        yield kind & _NESTED, data[at + _ATTRIBUTE.size : at + length]
-        at += (length + 3) & ~3
-
-
-def can_interfaces() -> list[str]:
-    """Names of the CAN interfaces that there are."""
-    return sorted(name for _, name in socket.if_nameindex() if _is_can(name))
-
-
-def _is_can(name: str) -> bool:
-    try:
-        return read_link(name).can
-    except OSError:  # gone meanwhile
-        return False
-
-
-# A raw CAN socket of Linux, set up, and what its errors mean.
-
 BUFFER_S = 10.0
 """A process that is stopped, swapped out or starved for so long loses nothing.
 The memory is taken only while frames wait."""
@@ -259,7 +254,7 @@ FRAME_BYTES = 768  # that the kernel counts for a frame that waits: 256 and 512
 DROPS, MEMORY = 40, 55  # SO_RXQ_OVFL, SO_MEMINFO
 STAMPS, STAMPS_OLD = 64, 35  # SO_TIMESTAMPNS: of 64 bits everywhere since Linux 5.1, and as before
 HARDWARE, HARDWARE_OLD = 65, 37  # SO_TIMESTAMPING likewise
-FILTER, _ERROR_FILTER, _LOOPBACK, OWN, _FD_FRAMES = 1, 2, 3, 4, 5  # CAN_RAW_…, at level SOL_CAN_RAW
+FILTER, _ERROR_FILTER, _LOOPBACK, OWN, _ACCEPT_FD = 1, 2, 3, 4, 5  # CAN_RAW_…, at level SOL_CAN_RAW
 _ALL_ERRORS = 0x1FFF_FFFF
 BUFFER_BY_FORCE = 33  # SO_RCVBUFFORCE
 _HARDWARE_FLAGS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 6  # stamps of reception, the adapter's as they are and the kernel's
@@ -282,7 +277,7 @@ def set_up(sock: socket.socket, settings: SocketCanOptions, *, fd: bool) -> None
     sock.setsockopt(raw, _LOOPBACK, int(settings.local_loopback))
     sock.setsockopt(raw, OWN, int(settings.receive_own_messages))
     if fd:
-        sock.setsockopt(raw, _FD_FRAMES, 1)
+        sock.setsockopt(raw, _ACCEPT_FD, 1)
     sock.setsockopt(every, DROPS, 1)
     wanted = (HARDWARE, HARDWARE_OLD) if settings.hardware_timestamps else (STAMPS, STAMPS_OLD)
     value = _HARDWARE_FLAGS if settings.hardware_timestamps else 1
@@ -328,9 +323,6 @@ def reason(e: OSError, name: str) -> str:
         return f"{where}: nothing more can be sent, its queue is full: no other node acknowledges, or the bus is off"
     return f"{where}: {os.strerror(code) if code else e}"
 
-
-# What `recvmsg` on a raw CAN socket gave, as a frame: its bytes, its time, and the
-# kernel's count of what it lost.
 
 _NS = 1_000_000_000
 _COUNT = struct.Struct("=I")
@@ -477,7 +469,7 @@ class SocketCan:
                 self._failure = reason(e, self._name)
                 continue
             frame = frame_of(raw, ancillary, flags)
-            if frame.flags & _ERROR and frame.source & BUS_OFF:
+            if frame.flags & _ERROR and frame.source & error_frame.BUS_OFF:
                 self._bus_off = True
             frames.append(frame)
         return frames

@@ -1,5 +1,6 @@
-"""What a reader of a log gives: frames, and an account of what was in the log
-besides."""
+"""What a reader of a log gives: frames, which of them have a moment, and an
+account of what was in the log besides; the lines of a log that is text, and the
+dates in them."""
 
 from __future__ import annotations
 
@@ -77,8 +78,6 @@ class Account:
         self.damage = self.damage or f"{where}: {what}"
 
 
-# Moments, and which frames of a log have one.
-
 LONGEST_NS = 2**62
 """A hundred and forty-six years, since the epoch or between two times: what is
 longer is damage."""
@@ -128,8 +127,6 @@ def _has_time(placed: Placed) -> bool:
     frame = placed[1]
     return isinstance(frame, LoggedFrame) and frame.time_ns is not None
 
-
-# Lines of a log that is text, and the dates in them.
 
 BLOCK = 2**16  # bytes that are read at once
 LINE_MOST = 4096  # bytes; a CAN FD frame of Vector's has some 400

@@ -1,4 +1,6 @@
-"""The entry point ``mcap``."""
+"""Sensors whose samples are messages in MCAP files: their profile, the decoder of
+a stream (one sample a message, in the order in which they were logged), and the
+entry point ``mcap``."""
 
 from __future__ import annotations
 
@@ -10,16 +12,20 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import Device, RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.logs.frames import LONGEST_NS
-from triaxcal_drivers.mcap.fields import Read, reader
-from triaxcal_drivers.mcap.schema import MessageSchema
-from triaxcal_drivers.nearest import nearest
-from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Bundle, Profile, Strict
+from triaxcal_drivers.mcap.messages import MessageSchema, Read, reader
+from triaxcal_drivers.profile import (
+    CHANNELS_MOST,
+    READING_CHANNELS,
+    STREAMS_MOST,
+    Bundle,
+    Profile,
+    Strict,
+    require_readings,
+)
 
-# A profile of messages in an MCAP file.
-
-READING_CHANNELS = tuple("u" + axis for axis in AXES)
 FieldPath = Annotated[
     str,
     Field(
@@ -64,9 +70,7 @@ class MessageStream(Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        for name in READING_CHANNELS:
-            if name not in self.channels:
-                raise ValueError(f"channels.{name} is missing")
+        require_readings(self.channels)
         return self
 
 
@@ -89,9 +93,6 @@ def schema_file(stream: str) -> str:
 
 class McapBus(Strict):
     """There is none."""
-
-
-# Messages to samples: one each, in the order in which they were logged.
 
 
 class MessageDecoder:

@@ -19,7 +19,7 @@ from triaxcal_drivers.errors import (
     SecondAnswer,
 )
 from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import ExtraAnswer, RawBatch, RawFlag
+from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.line import ModbusClient
 from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
 from triaxcal_drivers.modbus.protocol import (
@@ -32,6 +32,7 @@ from triaxcal_drivers.modbus.protocol import (
     Spoiled,
 )
 from triaxcal_drivers.registers import TYPES
+from triaxcal_drivers.two_senders import ExtraAnswer
 
 _BATCH_REPLIES = 32
 """A stream hands out what it has after so many replies, though more may be

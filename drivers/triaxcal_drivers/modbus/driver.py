@@ -7,11 +7,11 @@ from typing import Any
 
 from triaxcal_drivers.claim import canonical_port
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import Decoder, Device, LineLoad
 from triaxcal_drivers.modbus.decoder import ModbusDecoder
 from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
 from triaxcal_drivers.modbus.protocol import SerialLine
-from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import Bundle
 
 

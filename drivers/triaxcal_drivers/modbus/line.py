@@ -1,10 +1,12 @@
 """A Modbus line: one open connection for all units of this process that are
-reached by it.
+reached by it; and one unit on it, with its registers read and written, and its
+replies checked.
 
 A serial port has one owner, and a gateway serves few connections. So the units
 on them share one `Line`, which asks one unit at a time, in the order in which
 they come, also by TCP: what is behind a gateway is mostly one line. A unit that
-does not answer costs the others one time-out."""
+does not answer costs the others one time-out.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,6 @@ from weakref import WeakKeyDictionary
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import canonical_host, canonical_port
 from triaxcal_drivers.errors import BusError, DeviceSilent
-from triaxcal_drivers.interface import Answers, Extra
 from triaxcal_drivers.modbus.protocol import (
     WRITE_MULTIPLE,
     WRITE_SINGLE,
@@ -31,6 +32,7 @@ from triaxcal_drivers.modbus.protocol import (
     read_reply_bytes,
 )
 from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, read_request, reason_of, write_request
+from triaxcal_drivers.two_senders import Answers, Extra
 
 _FOR_NOW = (b"\x05", b"\x06", b"\x0a", b"\x0b")
 """Exceptions after which the unit's own reply may still come: it is busy, or a
@@ -316,10 +318,6 @@ def _key(where: TcpAddress | SerialLine) -> str:
     if isinstance(where, SerialLine):
         return canonical_port(where.port)
     return f"{canonical_host(where.host)}:{where.port}"
-
-
-# One unit on a Modbus line: its registers read and written, and its replies
-# checked.
 
 
 class ModbusClient:

@@ -16,10 +16,9 @@ from triaxcal_drivers.modbus.protocol import (
     SerialLine,
     TcpAddress,
 )
-from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
+from triaxcal_drivers.profile import CHANNELS_MOST, READING_CHANNELS, STREAMS_MOST, Profile, Register, Strict
 from triaxcal_drivers.registers import TYPES, WORD, CounterType, TimeType, WordType, in_words, next_in_words
 
-READING_CHANNELS = tuple("u" + axis for axis in AXES)
 Order = Literal["big", "little"]
 Table = Literal["input", "holding"]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]

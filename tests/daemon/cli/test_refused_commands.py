@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
 from triaxcald.provision.state import Held
 from triaxcald.run.line import Outcome

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 
 Run = Callable[..., Any]
 PROFILE = BUILT_IN / "triax-ref-can.toml"

@@ -14,10 +14,10 @@ from tests.devices.memory import Electronics
 from tests.devices.place import Place, Trouble
 from tests.devices.profiles import Timing, profile_text
 from tests.devices.table import NEW, OLD
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError, RegisterRefused
-from triaxcal_drivers.interface import ExtraAnswer
-from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import DaemonError
 from triaxcald.provision.access import Pace, RegisterLink
 from triaxcald.provision.journal import journaled_image, parse

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from triaxcal_drivers.errors import DeviceSilent, RegisterRefused
-from triaxcal_drivers.interface import ExtraAnswer
 from triaxcal_drivers.profile import Bundle, Profile, Register
+from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.provision.access import Pace
 
 Fault = Literal[

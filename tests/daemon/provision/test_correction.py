@@ -14,8 +14,8 @@ from tests.devices.habits import Habits
 from tests.devices.profiles import DBC_FILE, Driver, Timing, Wording, dbc_text, profile_text
 from tests.devices.table import NEW, OLD, Coefficients
 from triaxcal.errors import Refused
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.registers import Snapshot, not_neutral, require_readings_before
 

@@ -13,7 +13,7 @@ from tests.daemon.provision.host import Host
 from tests.devices.habits import Habits
 from tests.devices.profiles import Timing, profile_text
 from tests.devices.table import OLD
-from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.errors import DiskError, InputError
 from triaxcald.provision.journal import Entry, Journal, Owner, journals_of, open_journal, parse

@@ -11,8 +11,8 @@ import pytest
 from tests.devices.habits import Habits
 from tests.devices.in_memory import VirtualClock
 from tests.devices.profiles import profile_text
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import DeviceBusy, DeviceSilent, RegisterRefused
-from triaxcal_drivers.loading import parse_bundle
 from triaxcald.provision.access import Pace
 from triaxcald.provision.power import least_off_s, power_cycled
 

@@ -10,8 +10,8 @@ import pytest
 
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import ProvisionError

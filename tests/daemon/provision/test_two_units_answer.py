@@ -18,7 +18,7 @@ from tests.devices.place import Place, Trouble
 from tests.devices.profiles import Timing, Wording
 from tests.devices.sdo import SdoServer
 from tests.devices.table import FACTORY, OLD
-from triaxcal_drivers.interface import KEYS_MOST, OPEN_MOST, Answers, Extra
+from triaxcal_drivers.two_senders import KEYS_MOST, OPEN_MOST, Answers, Extra
 from triaxcald.provision.state import DeviceState
 
 PATIENT = Timing(reply_s=10.0, silence_s=20.0, store_poll_s=20.0, reconnect_s=20.0)

@@ -10,7 +10,7 @@ import pytest
 from tests.devices.habits import Habits
 from tests.devices.profiles import profile_text
 from tests.devices.table import NEW, OLD
-from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.journal import Entry, Step, was_cut_short
 from triaxcald.provision.registers import Snapshot, image_of

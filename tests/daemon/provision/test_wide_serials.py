@@ -20,7 +20,7 @@ from tests.devices.motion import Motion
 from tests.devices.place import Place
 from tests.devices.profiles import Timing, calibration_text, profile_text
 from tests.devices.table import NEW, OLD
-from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity, same_serial

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.cli.line import _document, show_outcome, worst
 from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording

@@ -15,9 +15,9 @@ import pytest
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.catalogue import load_bundle, parse_bundle
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.registers import crc
 from triaxcald.simulation.can_unit import CanUnit, tpdos

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from triaxcal_drivers.catalogue import BUILT_IN, parse_bundle
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import SampleBlock
-from triaxcal_drivers.loading import BUILT_IN, parse_bundle
 from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.modbus.protocol import READ_INPUT, SerialLine, TcpAddress
 from triaxcal_drivers.profile import Bundle

@@ -11,10 +11,10 @@ from typing import Any, cast
 
 import pytest
 
+from triaxcal_drivers.catalogue import driver_named, load_bundle
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.host_clock import SteadyClock
 from triaxcal_drivers.interface import Gap, RawBatch
-from triaxcal_drivers.loading import driver_named, load_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.errors import TwoAnswer
 from triaxcald.inputs import CALIBRATION, VERIFICATION

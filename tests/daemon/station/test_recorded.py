@@ -10,9 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
-from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION

@@ -12,8 +12,8 @@ import pytest
 
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.loading import load_bundle
 from triaxcald.errors import InputError
 from triaxcald.station.config import Station, load_station
 from triaxcald.station.lines import check_lines

@@ -15,9 +15,9 @@ from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import PatientSdo
-from triaxcal_drivers.can.receive import BATCH_S, FrameQueue
+from triaxcal_drivers.can.line import BATCH_S, FrameQueue
 from triaxcal_drivers.errors import BusError
-from triaxcal_drivers.interface import Answers
+from triaxcal_drivers.two_senders import Answers
 
 HELD_UP_S = 30.0
 ANSWER = bytes.fromhex("43 18 10 01 41 49 52 54")

@@ -10,9 +10,9 @@ import pytest
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, ProfileError, RegisterRefused
 from triaxcal_drivers.interface import RawBatch, RawFlag
-from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 START = (0x000, "01 05")

@@ -1,9 +1,9 @@
-"""One open bus for all units of this process on it, with the adapter played by
-the test."""
+"""One open bus for all units of this process on it, with the adapter played by the test."""
 
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -13,13 +13,12 @@ from triaxcal_drivers.can import line as can_line
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
-from triaxcal_drivers.can.line import MUTE_S, join, leave
+from triaxcal_drivers.can.line import MUTE_S, OVERFLOW, join, leave, opened
 from triaxcal_drivers.can.model import CanBus
-from triaxcal_drivers.can.receive import OVERFLOW
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import BusError, DeviceRestarted
 from triaxcal_drivers.host_clock import SteadyClock
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 BEGUN_NS = 1_700_000_000_000_000_000
@@ -178,3 +177,30 @@ async def test_a_boot_up_message_ends_the_stream_at_once(opened: list[Played], b
     with pytest.raises(DeviceRestarted, match=r"^a unit at node 5 on socketcan can0 has started"):
         await anext(stream)
     await device.close()
+
+
+async def test_a_bus_that_was_given_up_while_it_opened_is_closed() -> None:
+    asked, answered, closed = threading.Event(), threading.Event(), threading.Event()
+
+    def slow() -> str:
+        asked.set()
+        answered.wait(10)
+        return "a bus"
+
+    def close(bus: str) -> None:
+        assert bus == "a bus"
+        closed.set()
+
+    opening = asyncio.create_task(opened(slow, close))
+    await asyncio.to_thread(asked.wait, 10)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    answered.set()
+    assert await asyncio.to_thread(closed.wait, 10)
+
+
+async def test_a_bus_that_is_waited_for_stays_open() -> None:
+    closed = threading.Event()
+    assert await opened(lambda: "a bus", lambda _: closed.set()) == "a bus"
+    assert not closed.is_set()

@@ -13,12 +13,11 @@ from triaxcal_drivers.can import line as can_line
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
-from triaxcal_drivers.can.line import MUTE_S, REOPENED, BusListener, CanLine, join, leave
+from triaxcal_drivers.can.line import MUTE_S, OVERFLOW, REOPENED, BusListener, CanLine, join, leave
 from triaxcal_drivers.can.model import BusSettings, CanBus
-from triaxcal_drivers.can.receive import OVERFLOW
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
-from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 BEGUN_NS = 1_700_000_000_000_000_000

@@ -7,7 +7,7 @@ import pytest
 
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Frame
-from triaxcal_drivers.can.receive import BATCH_FRAMES, CONTROLLER_OVERFLOW, OVERFLOW, OVERRUN, FrameQueue
+from triaxcal_drivers.can.line import BATCH_FRAMES, CONTROLLER_OVERFLOW, OVERFLOW, OVERRUN, FrameQueue
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawFlag
 

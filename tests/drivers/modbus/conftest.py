@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 PROFILE = """

@@ -253,7 +253,7 @@ def test_samples_do_not_depend_on_how_records_are_cut_into_batches(make_full, hi
 
 @pytest.fixture(scope="module")
 def make_full(request):
-    from triaxcal_drivers.loading import parse_bundle
+    from triaxcal_drivers.catalogue import parse_bundle
 
     parsed = parse_bundle(
         request.getfixturevalue("profile_text").replace("\n[registers]\n", FULL).encode(), {}, where="t"

@@ -8,7 +8,7 @@ import pytest
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
-from triaxcal_drivers.validation import validate
+from triaxcal_drivers.toml_text import validate
 
 
 @pytest.mark.parametrize(

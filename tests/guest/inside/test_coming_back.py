@@ -15,9 +15,9 @@ import pytest
 from tests.guest.inside.conftest import ip
 from tests.guest.inside.program import Command, events
 from tests.guest.inside.witness import Sender, listeners
-from triaxcal_drivers.can.receive import OVERFLOW
+from triaxcal_drivers.can.line import OVERFLOW
+from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.loading import BUILT_IN
 from triaxcal_drivers.profile import READINGS
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of

@@ -1,11 +1,11 @@
-"""From the text of a profile to a `Bundle`: the driver that it names validates
-it, and its files are read."""
+"""The drivers that are installed, found by entry point, none imported until asked
+for; and from the text of a profile to a `Bundle`: the driver that it names
+validates it, and its files are read."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -13,55 +13,12 @@ from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.errors import DriverMissing, ProfileError
 from triaxcal_drivers.files import inside, read_whole, size
-from triaxcal_drivers.nearest import clipped, closest
+from triaxcal_drivers.hints import absent, clipped, closest, lacking
 from triaxcal_drivers.profile import Bundle
-from triaxcal_drivers.validation import PROFILE, parse_toml, read_toml, validate
+from triaxcal_drivers.toml_text import PROFILE, parse_toml, read_toml, validate
 
 if TYPE_CHECKING:
     from triaxcal_drivers.interface import Driver
-
-
-# Packages that a bare install lacks, and which extra of it brings them.
-
-EXTRAS = {
-    "can": "can",
-    "canopen": "can",
-    "pymodbus": "modbus",
-    "serial": "modbus",
-    "msgpack": "station",
-    "asammdf": "logs",
-    "rosbags": "logs",
-    "lz4": "logs",
-}
-"""By the name that is imported."""
-CALLED = {"can": "python-can", "serial": "pyserial"}
-"""Where the package has another name than what is imported."""
-
-
-def absent(modules: Iterable[str]) -> str | None:
-    """What to install, of modules by the names that are imported; None where
-    all are there."""
-    missing = [m for m in modules if importlib.util.find_spec(m) is None]
-    if not missing:
-        return None
-    ours = [m for m in missing if m in EXTRAS]
-    extras = {EXTRAS[m] for m in ours}
-    return _told((ours or missing)[0], extras.pop() if len(extras) == 1 else "station" if extras else None)
-
-
-def lacking(e: ModuleNotFoundError) -> str | None:
-    """What to install; None where it is no package of ours."""
-    module = (e.name or "").partition(".")[0]
-    return _told(module, EXTRAS[module]) if module in EXTRAS else None
-
-
-def _told(module: str, extra: str | None) -> str:
-    brings = f"; pip install 'triaxcal[{extra}]' brings it" if extra else ""
-    return f"the package {CALLED.get(module, module)} is not installed{brings}"
-
-
-# The drivers that are installed, found by entry point; none is imported until asked
-# for.
 
 GROUP = "triaxcal.drivers"
 

@@ -1,19 +1,111 @@
-"""The numbers of a stream in its messages, whatever their encoding."""
+"""The numbers of a stream in its messages, whatever their encoding: the one file
+that imports rosbags.
+
+The log says how messages are encoded; a recording keeps that beside its profile
+(`MessageSchema`). Of two libraries that read definitions of ROS 2 messages,
+mcap-ros2-support refuses capitals in the names of fields, which real packages
+have. rosbags parses; its decoders, which it makes by running generated Python,
+are not used. Of CDR, ROS 2's encoding, only what is asked for is read; the rest
+is stepped over, and nothing is believed that is longer than the message.
+"""
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.logs.frames import LONGEST_NS
-from triaxcal_drivers.mcap.definitions import Described, Fields, message_types
-from triaxcal_drivers.mcap.schema import DEFINITION_MOST, MessageSchema
-from triaxcal_drivers.nearest import nearest
 
-# Numbers out of CDR, the encoding of ROS 2's messages. No I/O.
+FORMAT = "triaxcal.messages/1"
+DEFINITION_MOST = 256 * 2**10  # bytes; a sensor's message with all that it is made of has some ten thousand
+
+
+@dataclass(frozen=True)
+class MessageSchema:
+    """``encoding`` of the messages (cdr, json, protobuf), ``language`` of their
+    definition (ros2msg, ros2idl, protobuf, jsonschema). Where the
+    ``stamp_stands_still``, it is no time."""
+
+    name: str
+    encoding: str
+    language: str
+    definition: bytes
+    stamp_stands_still: bool = False
+
+    def to_bytes(self) -> bytes:
+        document = {
+            "format": FORMAT,
+            "name": self.name,
+            "encoding": self.encoding,
+            "language": self.language,
+            "definition": base64.b64encode(self.definition).decode(),
+            "stamp_stands_still": self.stamp_stands_still,
+        }
+        return (json.dumps(document, indent=1) + "\n").encode()
+
+    @staticmethod
+    def of(data: bytes, where: str) -> MessageSchema:
+        """Raises ProfileError."""
+        try:
+            held = json.loads(data)
+            if held["format"] != FORMAT:
+                raise ValueError(held["format"])
+            name, encoding, language = (held[key] for key in ("name", "encoding", "language"))
+            if not all(isinstance(text, str) for text in (name, encoding, language)):
+                raise TypeError("texts")
+            definition = base64.b64decode(held["definition"], validate=True)
+            return MessageSchema(name, encoding, language, definition, bool(held["stamp_stands_still"]))
+        except (ValueError, KeyError, TypeError, RecursionError, binascii.Error) as e:
+            raise ProfileError(f"{where}: expected a description of messages ({FORMAT})") from e
+
+
+_IDL_PARTS = re.compile(r"^={80}\nIDL: .*\n", re.MULTILINE)
+"""What stands between the files of a definition in IDL (rosbag2)."""
+
+Fields = Sequence[tuple[str, "Described"]]
+Described = tuple[str, Any]
+"""``("base", name)``, ``("message", name)``, ``("array", (element, length))`` or
+``("sequence", element)``."""
+
+
+def message_types(name: str, language: str, definition: bytes, where: str) -> tuple[str, Mapping[str, Fields]]:
+    """The fields of each message by its name, and the name of the outermost
+    one. Raises ProfileError; ModuleNotFoundError without rosbags."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+    from rosbags.typesys.base import TypesysError
+
+    full = name if "/msg/" in name else name.replace("/", "/msg/", 1)
+    try:
+        text = definition.decode()
+        if language == "ros2idl":
+            parts = filter(str.strip, _IDL_PARTS.split(text))
+            parsed = {n: fields for part in parts for n, fields in get_types_from_idl(part).items()}
+        else:
+            parsed = dict(get_types_from_msg(text, full))
+    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, KeyError, AssertionError) as e:
+        raise ProfileError(f"{where}: the definition of '{name}' ({language}) cannot be read") from e
+    if full not in parsed:
+        raise ProfileError(f"{where}: the definition of '{name}' does not hold it")
+    return full, {str(n): [(f, _described(d)) for f, d in fields] for n, (_, fields) in parsed.items()}
+
+
+def _described(desc: Any) -> Described:
+    kind = desc[0].name
+    if kind == "BASE":
+        return "base", str(desc[1][0])
+    if kind == "NAME":
+        return "message", str(desc[1])
+    element, length = desc[1]
+    return ("array", (_described(element), int(length))) if kind == "ARRAY" else ("sequence", _described(element))
+
 
 _FORMATS = {
     "bool": "?", "byte": "B", "octet": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",

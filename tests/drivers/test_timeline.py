@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from triaxcal_drivers.modbus.decoder import Arrivals, Clockwork, Timeline
+from triaxcal_drivers.timeline import Arrivals, Clockwork, Timeline
 
 PERIOD_NS = 10_000_000
 COUNTED = Clockwork(PERIOD_NS, counter_bits=16, stamp_bits=None, repeat_window=12)

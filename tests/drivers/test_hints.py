@@ -6,7 +6,7 @@ import importlib.util
 
 import pytest
 
-from triaxcal_drivers.loading import absent
+from triaxcal_drivers.hints import absent
 
 
 @pytest.fixture
