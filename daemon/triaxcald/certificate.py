@@ -32,10 +32,20 @@ from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
+from triaxcal_drivers.roles import (
+    AXES,
+    CRC_ROLE,
+    DATE_ROLE,
+    LINEAR,
+    LINEAR_ROLES,
+    MISALIGNMENT,
+    REFERENCE_ROLE,
+    SCALE_FACTOR,
+)
 from triaxcald.documents import loop_document, rezero_document
 from triaxcald.doubts import is_passing
 from triaxcald.pipeline import Pipeline, of_poses
-from triaxcald.provision.registers import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
+from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
 from triaxcald.software import compute_with_one_thread
 from triaxcald.software import drawn_with as drawn_with
@@ -43,7 +53,6 @@ from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
 
 DAY_S = 86_400
-REFERENCE_TEMPERATURE = "reference_temperature"
 TEMPERATURE = "temp_c"
 
 
@@ -149,25 +158,20 @@ def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, f
     """A sensor's coefficients by register role."""
     out = {
         f"{name}.{axis}": float(values[i])
-        for name, values in (
-            ("scale_factor", sensor.scale_factor),
-            ("misalignment", sensor.misalignment),
-            ("bias", sensor.bias),
-        )
-        for i, axis in enumerate("xyz")
+        for name, values in zip(LINEAR, (sensor.scale_factor, sensor.misalignment, sensor.bias), strict=True)
+        for i, axis in enumerate(AXES)
     }
     for effect, values in sensor.effects:
         out |= {f"{effect.name}.{c.name}": float(v) for c, v in zip(effect.coefficients, values, strict=True)}
     if TEMPERATURE in channel_reference:
-        out[REFERENCE_TEMPERATURE] = channel_reference[TEMPERATURE]
+        out[REFERENCE_ROLE] = channel_reference[TEMPERATURE]
     return out
 
 
 def why_not_written(profile: Profile) -> str | None:
     """Why a device cannot take a calibration at all: without one of the nine,
     the other eight would be wrong."""
-    linear = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
-    missing = [role for role in linear if profile.by_role(role) is None]
+    missing = [role for role in LINEAR_ROLES if profile.by_role(role) is None]
     return f"the device has no register for {', '.join(missing)}" if missing else None
 
 
@@ -280,8 +284,8 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
         return np.array([rounded.get(f"{effect.name}.{c.name}", float(v)) for c, v in pairs])
 
     worse = Sensor(
-        triple("scale_factor", sensor.scale_factor),
-        triple("misalignment", sensor.misalignment),
+        triple(SCALE_FACTOR, sensor.scale_factor),
+        triple(MISALIGNMENT, sensor.misalignment),
         triple("bias", sensor.bias),
         tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
     )
@@ -289,8 +293,8 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
     channels = with_scale(channels_of(poses, held.channel_reference), poses, sensor.scale_factor, sensor.bias)
     reference = dict(held.channel_reference)
     covariates = {n: channels[n] - v for n, v in reference.items()}
-    if TEMPERATURE in reference and REFERENCE_TEMPERATURE in rounded:
-        reference[TEMPERATURE] = rounded[REFERENCE_TEMPERATURE]
+    if TEMPERATURE in reference and REFERENCE_ROLE in rounded:
+        reference[TEMPERATURE] = rounded[REFERENCE_ROLE]
     shifted = {n: channels[n] - v for n, v in reference.items()}
     exact = np.linalg.norm(sensor.specific_force(u, covariates), axis=1)
     return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))

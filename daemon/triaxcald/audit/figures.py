@@ -11,6 +11,7 @@ from math import floor, log10
 from typing import Any
 
 from triaxcal.rounding import Printed
+from triaxcal_drivers.roles import LINEAR
 from triaxcald.audit.differences import SENTENCES
 
 SHARE = 1e-3
@@ -223,7 +224,7 @@ def _combined(budget: Mapping[str, Any]) -> dict[str, float | None]:
 def _place_of(role: str) -> str:
     """Of a register's role, where its coefficient stands in a budget."""
     group, _, name = role.partition(".")
-    return f"{group}[{'xyz'.index(name)}]" if group in ("scale_factor", "misalignment", "bias") else f"effects.{role}"
+    return f"{group}[{'xyz'.index(name)}]" if group in LINEAR else f"effects.{role}"
 
 
 def _placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:

@@ -9,6 +9,7 @@ from enum import Enum, auto
 from functools import cached_property
 
 from triaxcal_drivers.profile import Profile
+from triaxcal_drivers.roles import WRITE_COUNTER_ROLE
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
@@ -111,7 +112,7 @@ class Traffic:
 
     def counts(self) -> list[bytes]:
         """What the device's counter of stores was read as."""
-        name = self.profile.by_role("write_counter")
+        name = self.profile.by_role(WRITE_COUNTER_ROLE)
         return [a.raw for a in self.accesses if a.register == name and a.operation == "read" and not a.error]
 
     def silent_since(self, at: int) -> bool:

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
+from triaxcal_drivers.roles import WRITE_COUNTER_ROLE
 from triaxcald.errors import DiskError, InputError, ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
@@ -657,7 +658,7 @@ class Provisioning:
         await reconnect(self.link, self.bundle.profile)
 
     async def _times_stored(self) -> bytes | None:
-        name = self.bundle.profile.by_role("write_counter")
+        name = self.bundle.profile.by_role(WRITE_COUNTER_ROLE)
         return None if name is None else await self.link.read(name)
 
     def _by_counter(self, before: bytes | None, after: bytes | None) -> None:

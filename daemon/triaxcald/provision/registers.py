@@ -18,13 +18,22 @@ from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import ProfileError, RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, SCALE_FACTOR_RATIO, Bundle, Profile
+from triaxcal_drivers.roles import (
+    AXES,
+    BIAS,
+    CRC_ROLE,
+    DATE_ROLE,
+    LINEAR,
+    MISALIGNMENT,
+    NOT_CALIBRATION,
+    REFERENCE_ROLE,
+    SCALE_FACTOR,
+    parsed,
+)
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import read_serial
 
 # What is to be written: a calibration's coefficients as raw register words. No I/O.
-
-CRC_ROLE, DATE_ROLE, REFERENCE_ROLE = "calibration_crc", "calibration_date", "reference_temperature"
-NOT_CALIBRATION = ("serial_number", "write_counter")
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,7 @@ def image_of(profile: Profile, raw: Mapping[str, bytes]) -> RegisterImage:
 
 def _refuse_gaps(roles: set[str], coefficients: Mapping[str, float]) -> None:
     """Zero is a fair value for an effect that is absent, but not for these."""
-    missing = [role for role in sorted(roles) if role.startswith("scale_factor.") and role not in coefficients]
+    missing = [role for role in sorted(roles) if role.startswith(f"{SCALE_FACTOR}.") and role not in coefficients]
     thermal = [role for role, value in coefficients.items() if role.startswith("temperature_") and value]
     if thermal and REFERENCE_ROLE in roles and REFERENCE_ROLE not in coefficients:
         missing.append(f"{REFERENCE_ROLE} (of {thermal[0]})")
@@ -169,8 +178,8 @@ async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | N
 Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
-    "misalignment": (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
-    "bias": (-20.0, 20.0),  # g: the full scale of the triads in question
+    MISALIGNMENT: (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
+    BIAS: (-20.0, 20.0),  # g: the full scale of the triads in question
     REFERENCE_ROLE: (-273.15, 1000.0),  # °C
     DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
 }
@@ -220,15 +229,15 @@ def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) ->
     high = math.inf if register.maximum is None else register.maximum
     if not low <= value <= high:
         return Doubt("outside_limits", name, value, low, high)
-    quantity, _, axis = (register.role or "").partition(".")
-    if quantity == "scale_factor":
+    role = parsed(register.role)
+    if role.quantity == SCALE_FACTOR:
         nominal = profile.output.nominal_scale_factor
-        size = abs(nominal["xyz".index(axis)] if nominal else wanted.get(name, math.nan))
+        size = abs(nominal[role.axis] if nominal else wanted.get(name, math.nan))
         low, high = size / SCALE_FACTOR_RATIO, size * SCALE_FACTOR_RATIO
         implausible = abs(value) < low or abs(value) > high
     else:
-        low, high = BOUNDS.get(quantity, (-EFFECT_BOUND, EFFECT_BOUND))
-        implausible = quantity != CRC_ROLE and not low <= value <= high
+        low, high = BOUNDS.get(role.quantity, (-EFFECT_BOUND, EFFECT_BOUND))
+        implausible = role.quantity != CRC_ROLE and not low <= value <= high
     return Doubt("implausible", name, value, low, high) if implausible else None
 
 
@@ -264,7 +273,7 @@ def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | No
     """The sensor that the registers describe, and its reference temperature in
     °C; None where they describe none."""
     held = {r.role: profile.decode(n, snapshot.raw[n]) for n, r in profile.registers.items() if n in snapshot.raw}
-    linear = [[held.get(f"{name}.{axis}") for axis in "xyz"] for name in ("scale_factor", "misalignment", "bias")]
+    linear = [[held.get(f"{name}.{axis}") for axis in AXES] for name in LINEAR]
     if any(value is None or not np.isfinite(value) for values in linear for value in values):
         return None
     scale_factor, misalignment, bias = (np.array(values, dtype=float) for values in linear)
@@ -272,8 +281,8 @@ def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | No
         return None
     effects: dict[str, dict[str, float]] = {}
     for role, value in held.items():
-        name, dot, coefficient = (role or "").partition(".")
-        if dot and name not in ("scale_factor", "misalignment", "bias"):
+        name, coefficient = parsed(role)
+        if coefficient and name not in LINEAR:
             effects.setdefault(name, {})[coefficient] = value
     found = [effect_of(name, values) for name, values in effects.items() if any(values.values())]
     return Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(REFERENCE_ROLE, 0.0)
@@ -353,13 +362,13 @@ def _correcting(profile: Profile) -> tuple[str, ...]:
 
 def _is_neutral(profile: Profile, name: str, raw: bytes) -> bool:
     register, value = profile.registers[name], profile.decode(name, raw)
-    quantity, _, axis = (register.role or "").partition(".")
-    if quantity != "scale_factor":
+    role = parsed(register.role)
+    if role.quantity != SCALE_FACTOR:
         return value == _nearest(profile, name, 0.0)
     # The device divides by it. Who wrote the nominal one may have rounded it
     # otherwise, by a step of the register at most.
     nominal = profile.output.nominal_scale_factor
-    neutral = [1.0, *([nominal["xyz".index(axis)]] if nominal else [])]
+    neutral = [1.0, *([nominal[role.axis]] if nominal else [])]
     return any(abs(value - _nearest(profile, name, n)) <= codec.step(register, n) * (1 + 1e-9) for n in neutral)
 
 

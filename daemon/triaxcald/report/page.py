@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from triaxcal.text.traces import SMOOTH
+from triaxcal_drivers.roles import LINEAR
 from triaxcald import text
 from triaxcald.certificate import Certified
 from triaxcald.doubts import assumption
@@ -119,7 +120,7 @@ def _line(entry: Mapping[str, object]) -> BudgetLine:
 
 def _expanded(known: Mapping[str, object]) -> Iterator[tuple[str, float | None]]:
     """Of every coefficient, by a name like `bias.x` or `warm_up.x`."""
-    for group in ("scale_factor", "misalignment", "bias"):
+    for group in LINEAR:
         for axis, value in zip("xyz", vector(known.get(group)) or (None, None, None), strict=True):
             yield f"{group}.{axis}", value
     for effect, values in mapping(known.get("effects")).items():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.registers import TYPES, crc
+from triaxcal_drivers.roles import AXES, BIAS, LINEAR, MISALIGNMENT, SCALE_FACTOR
 from triaxcald.abort import at_abort
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable, write_bytes
@@ -84,12 +85,10 @@ class Entry:
         return int.from_bytes(raw, "big")
 
 
-_PER_AXIS = (
-    "scale_factor", "misalignment", "bias", "second_order", "temperature_bias", "temperature_scale_factor",
-)  # fmt: skip
+_PER_AXIS = (*LINEAR, "second_order", "temperature_bias", "temperature_scale_factor")
 
 CRC = "calibration_crc"
-COVERED = (*(f"{name}_{axis}" for name in _PER_AXIS for axis in "xyz"),
+COVERED = (*(f"{name}_{axis}" for name in _PER_AXIS for axis in AXES),
            "reference_temperature", "calibration_date")  # fmt: skip
 """The calibration registers that the checksum covers, in its order."""
 CALIBRATION = (*COVERED, CRC)
@@ -122,7 +121,7 @@ def checksum(copy: Mapping[str, bytes]) -> bytes:
 def factory_calibration() -> dict[str, bytes]:
     """The nominal scale factor and the reference temperature; nothing else,
     dated 1970-01-01."""
-    values = {f"scale_factor_{axis}": -2.4 for axis in "xyz"} | {"reference_temperature": 25.0}
+    values = {f"{SCALE_FACTOR}_{axis}": -2.4 for axis in AXES} | {"reference_temperature": 25.0}
     copy = {name: TABLE[name].encode(values.get(name, 0.0)) for name in COVERED}
     return copy | {CRC: checksum(copy)}
 
@@ -410,12 +409,12 @@ class ReferenceUnit:
             dT = temperature_raw[:, None] / 100 - TABLE["reference_temperature"].decode(
                 self._ram["reference_temperature"]
             )
-            v = counts * (FULL_SCALE_V / FULL_SCALE_COUNTS) / self._axes("scale_factor")
-            v -= self._axes("bias") + self._axes("temperature_bias") * dT
+            v = counts * (FULL_SCALE_V / FULL_SCALE_COUNTS) / self._axes(SCALE_FACTOR)
+            v -= self._axes(BIAS) + self._axes("temperature_bias") * dT
             s = v
             for _ in range(4):
                 s = (v - self._axes("second_order") * s**2) / (1 + self._axes("temperature_scale_factor") * dT)
-            ax, ay, az = self._axes("misalignment")
+            ax, ay, az = self._axes(MISALIGNMENT)
             # R = [[1, az, ay], [0, 1, ax], [0, 0, 1]], solved from below
             z = s[:, 2]
             y = s[:, 1] - ax * z
@@ -426,7 +425,7 @@ class ReferenceUnit:
         return limited
 
     def _axes(self, quantity: str) -> NDArray[np.float64]:
-        return np.array([TABLE[f"{quantity}_{a}"].decode(self._ram[f"{quantity}_{a}"]) for a in "xyz"])
+        return np.array([TABLE[f"{quantity}_{a}"].decode(self._ram[f"{quantity}_{a}"]) for a in AXES])
 
 
 # The EEPROM of a simulated unit as a file, so that it survives the process.

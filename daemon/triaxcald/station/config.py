@@ -24,6 +24,7 @@ from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
+from triaxcal_drivers.roles import LINEAR_ROLES, OTHER_ROLES
 from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml, validate
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
@@ -346,18 +347,15 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             )
 
 
-_OTHER_ROLES = ("reference_temperature", "calibration_date", "calibration_crc", "serial_number", "write_counter")
-
-
 def _check_roles(bundle: Bundle, *, where: str) -> None:
     """Only the daemon knows the effects, whose coefficients are roles. Raises
     InputError with the nearest one."""
-    known = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
-    if any(r.role not in (None, *known, *_OTHER_ROLES) for r in bundle.profile.registers.values()):
+    known = list(LINEAR_ROLES)
+    if any(r.role not in (None, *known, *OTHER_ROLES) for r in bundle.profile.registers.values()):
         from triaxcal.effects import CATALOGUE  # of a device that holds none, it is not needed
 
         known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
-    known += _OTHER_ROLES
+    known += OTHER_ROLES
     for name, register in bundle.profile.registers.items():
         if register.role is not None and register.role not in known:
             raise InputError(
