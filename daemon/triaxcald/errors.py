@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -90,6 +89,8 @@ def exit_code_of(e: BaseException) -> int:
     memory ran out is one like a full disk."""
     if ran_out_of_memory(e):
         return DISK
+    import asyncio  # 30 ms, which the start of a command does without
+
     match e:
         case Refused() | RegisterValueError():
             return REFUSED

@@ -11,15 +11,17 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from triaxcal.model.gravity import HEIGHTS_M
-from triaxcal.model.samples import Moment
 from triaxcal_drivers.hints import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
+
+if TYPE_CHECKING:
+    from triaxcal.model.samples import Moment
 
 # Arguments that several commands share, and a parser whose errors are one line.
 
@@ -74,6 +76,8 @@ def signs(text: str) -> tuple[int, int, int]:
 
 def moment(text: str) -> Moment | float:
     """`end`, `mean`, or seconds from the first sample."""
+    from triaxcal.model.samples import Moment  # numpy, which help does without
+
     if text in (Moment.END, Moment.MEAN):
         return Moment(text)
     try:
@@ -602,7 +606,7 @@ def _audits(commands: Any) -> None:
     p.add_argument("--stream", default=READINGS, help="or corrected: the device's own output, in g")
     p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="verification: the check poses after writing")
     p = _command(
-        parts, "import", "importing:import_command", "make a recording of a log that others recorded",
+        parts, "import", "recordings:import_command", "make a recording of a log that others recorded",
         "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, or MCAP with messages of ROS 2, JSON or protobuf, "
         "told by the file's first bytes; packed with gzip or not.",
         "log import drive.blf --profile imu.toml -o rec.mcap",

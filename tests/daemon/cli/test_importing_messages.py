@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from mcap.writer import CompressionType, Writer
-from tests.drivers.mcap.test_cdr import IMU, IMU_FIELDS, LINE, imu_message
+
+from tests.drivers.mcap.test_messages import IMU, IMU_FIELDS, LINE, imu_message
 
 Run = Callable[..., Any]
 T0 = 1_700_000_000_000_000_000

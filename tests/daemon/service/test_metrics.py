@@ -138,7 +138,7 @@ def test_who_asks_for_the_head_alone_gets_no_body(tmp_path: Path) -> None:
 
 
 def test_a_client_that_says_nothing_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.service.metrics.IDLE_S", 0.05)
+    monkeypatch.setattr("triaxcald.service.supervisor.IDLE_S", 0.05)
     with served(0, list, tmp_path) as port, socket.create_connection(("127.0.0.1", port), timeout=10) as idle:
         assert idle.recv(1) == b""
 
@@ -176,6 +176,6 @@ def test_a_port_that_this_user_may_not_have_is_bad_input(tmp_path: Path, monkeyp
     def refused(*_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("triaxcald.service.metrics._Server", refused)
+    monkeypatch.setattr("triaxcald.service.supervisor._Server", refused)
     with pytest.raises(InputError, match=r"^--metrics 80: "), served(80, list, tmp_path):
         pass
