@@ -31,7 +31,7 @@ from triaxcal.model.bias_directions import bias_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.next_recording import START_TO_START
+from triaxcal.uncertainty.another_day import START_TO_START
 
 COUNTS: tuple[int | None, ...] = (3, 4, 6, None)
 SEEDS, QUICK = 2000, 200

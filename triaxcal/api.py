@@ -31,7 +31,7 @@ from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import disturbances
 from triaxcal.text import diagnosis
-from triaxcal.uncertainty.next_recording import NextRecording, next_recording
+from triaxcal.uncertainty.another_day import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from triaxcal.interchange.calibration_document import (
 from triaxcal.rounding import chance, error, in_standard_errors, known_to, number, numbers, probability, uncertainty
 from triaxcal.text import bias_update, diagnosis
 from triaxcal.uncertainty import Stated, budget
-from triaxcal.uncertainty.next_recording import next_recording
+from triaxcal.uncertainty.another_day import next_recording
 from triaxcal.units import ErrorUnit, in_units_of
 from triaxcald.doubts import UNIT, choices_of
 

@@ -14,8 +14,8 @@ from triaxcal.arrays import Floats
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.frames.faces import LABELS, TURNS, axis_of, opposite
 from triaxcal.frames.fixture import Fixture, Quantity
-from triaxcal.frames.frames import Frames, UnitFrame
 from triaxcal.frames.orientations import Verticals, verticals, verticals_under
+from triaxcal.frames.unit_frames import Frames, UnitFrame
 from triaxcal.interchange.calibration_document import Document
 from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of

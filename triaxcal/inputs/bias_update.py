@@ -51,7 +51,7 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, SIGNIFICANT, lack_of_fit_p, within_pose_dof
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import probability
-from triaxcal.uncertainty.next_recording import START_TO_START
+from triaxcal.uncertainty.another_day import START_TO_START
 from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K
 
 SCALE_FACTOR_SHARE = 0.1

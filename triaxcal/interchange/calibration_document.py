@@ -31,7 +31,7 @@ from triaxcal.rounding import (
     uncertainty,
 )
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcal.uncertainty.next_recording import NextRecording, Scopes, next_recording
+from triaxcal.uncertainty.another_day import NextRecording, Scopes, next_recording
 from triaxcal.uncertainty.statements import Basis, UnmodelledTemperature
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 

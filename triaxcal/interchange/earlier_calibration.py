@@ -21,7 +21,7 @@ from triaxcal.interchange.calibration_reading import (
     uncertainty_over_error,
 )
 from triaxcal.model.sensor import LINEAR
-from triaxcal.uncertainty.next_recording import Source
+from triaxcal.uncertainty.another_day import Source
 
 
 def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Earlier:

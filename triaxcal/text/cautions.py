@@ -8,7 +8,7 @@ from functools import singledispatch
 import numpy as np
 
 from triaxcal.estimate import calibration as of_fit
-from triaxcal.frames import faces, frames, orientations, standing
+from triaxcal.frames import faces, orientations, standing, unit_frames
 from triaxcal.inputs import attitude, bias_update, datasheet
 from triaxcal.inputs.turning import rotation
 from triaxcal.number_format import micro_g, number_of, plain
@@ -241,7 +241,7 @@ def _(_: faces.SeveralCubes) -> str:
 
 
 @caution.register
-def _(c: frames.UnitsDisagree) -> str:
+def _(c: unit_frames.UnitsDisagree) -> str:
     return (
         f"the units disagree on the fixture's faces by {c.ratio:.1f} times what noise and seating explain (p "
         f"{c.p:.1g}): not one fixture, or it changed, or a unit moved in it; {RAISED}"
@@ -249,7 +249,7 @@ def _(c: frames.UnitsDisagree) -> str:
 
 
 @caution.register
-def _(c: frames.FacesMissing) -> str:
+def _(c: unit_frames.FacesMissing) -> str:
     return (
         f"nothing stood with {', '.join(c.faces)} up: the least-squares frame is that of the other faces, and differs "
         "from that of all six by the errors of the faces"
@@ -257,7 +257,7 @@ def _(c: frames.FacesMissing) -> str:
 
 
 @caution.register
-def _(c: frames.FaceFarOff) -> str:
+def _(c: unit_frames.FaceFarOff) -> str:
     return (
         f"a face is {c.angle_rad:.2g} rad off its axis: were these poses on the faces of one fixture, and the unit "
         "fixed in it?"

@@ -18,7 +18,7 @@ from triaxcal.poses.pose import PoseStart
 from triaxcal.poses.pose_in_words import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_do
 from triaxcal.uncertainty import Stated, budget
-from triaxcal.uncertainty.next_recording import NextRecording, Scopes, Source
+from triaxcal.uncertainty.another_day import NextRecording, Scopes, Source
 from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]

@@ -8,7 +8,7 @@ reference conditions. That last figure, its rms over the sphere, is what the
 sources are weighed by.
 """
 
-from triaxcal.uncertainty.budget import Budget, Combined, budget
+from triaxcal.uncertainty.combined import Budget, Combined, budget
 from triaxcal.uncertainty.components import Component
 from triaxcal.uncertainty.statements import Stated
 from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K

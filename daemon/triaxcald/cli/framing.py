@@ -15,9 +15,9 @@ import numpy as np
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, opposite, recognise
-from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
+from triaxcal.frames.unit_frames import Datum, Frames, frames
 from triaxcal.interchange.calibration_reading import but_is, sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.number_format import probability

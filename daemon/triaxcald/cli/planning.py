@@ -34,7 +34,7 @@ from triaxcal.planning.design import (
     target_effects,
     unseen_effects,
 )
-from triaxcal.planning.optimal import OptimalPlan, optimal
+from triaxcal.planning.optimal_plan import OptimalPlan, optimal
 from triaxcal.rounding import number, numbers, uncertainty
 from triaxcal.text.advice import to_move
 from triaxcald.cli.console import emit, say, show, table

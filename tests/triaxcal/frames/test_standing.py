@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from tests.half_turns import HANDS, stood
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import labelled
-from triaxcal.frames.frames import frames
 from triaxcal.frames.orientations import verticals
 from triaxcal.frames.standing import stand
+from triaxcal.frames.unit_frames import frames
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import poses_of
 from triaxcal.poses.stillness.detector import TURN_S, StillnessDetector

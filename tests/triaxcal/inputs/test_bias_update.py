@@ -24,7 +24,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.next_recording import START_TO_START
+from triaxcal.uncertainty.another_day import START_TO_START
 
 UNIT = Sensor(np.array([-2.41, 2.0, 3.1]), np.array([6e-3, 4e-3, -6e-3]), np.array([5e-3, -3e-3, 4e-3]))
 SIGNS = (-1, 1, 1)

@@ -13,7 +13,7 @@ from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects.contract import RUN
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.covariates import at_moment
-from triaxcal.uncertainty.budget import Budget
+from triaxcal.uncertainty.combined import Budget
 
 START_TO_START = 2e-3
 """In references, of |a| over the sphere, for a single recording: eight sensors of a
