@@ -12,9 +12,31 @@ Everything is loaded when it is first asked for.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from triaxcal import (
+        diagnosis,
+        distributions,
+        documents,
+        effects,
+        estimate,
+        evidence,
+        frames,
+        inputs,
+        interchange,
+        number_format,
+        pictures,
+        planning,
+        pooled_units,
+        poses,
+        rounding,
+        synthetic,
+        text,
+        uncertainty,
+        units,
+    )
     from triaxcal.api import (
         Diagnosis,
         PlannedPose,
@@ -28,69 +50,149 @@ if TYPE_CHECKING:
         rezero,
         verify,
     )
+    from triaxcal.arrays import Floats, Ints
     from triaxcal.documents import Calibration
-    from triaxcal.errors import InvalidData, MissingChannel, Refused, TriaxcalError
-    from triaxcal.poses.pose import Pose
+    from triaxcal.errors import InvalidData, MissingChannel, Refused, TooShort, TriaxcalError
+    from triaxcal.model.gravity import HEIGHTS_M, local_gravity_g
+    from triaxcal.model.samples import Moment, Samples
+    from triaxcal.model.sensor import Sensor
+    from triaxcal.poses.pose import Pose, StillSpan
+    from triaxcal.progress import Stage
     from triaxcal.uncertainty import Stated
 
     __version__: str
 
-_WHERE = {
-    "Calibration": "triaxcal.documents",
-    "Diagnosis": "triaxcal.api",
-    "InvalidData": "triaxcal.errors",
-    "MissingChannel": "triaxcal.errors",
-    "PlannedPose": "triaxcal.api",
-    "Pose": "triaxcal.poses.pose",
-    "Poses": "triaxcal.api",
-    "Refused": "triaxcal.errors",
-    "Stated": "triaxcal.uncertainty",
-    "TriaxcalError": "triaxcal.errors",
-    "Verification": "triaxcal.api",
-    "budget": "triaxcal.api",
-    "calibrate": "triaxcal.api",
-    "diagnose": "triaxcal.api",
-    "find_poses": "triaxcal.api",
-    "plan": "triaxcal.api",
-    "rezero": "triaxcal.api",
-    "verify": "triaxcal.api",
+_ROOMS = (
+    "diagnosis",
+    "distributions",
+    "documents",
+    "effects",
+    "estimate",
+    "evidence",
+    "frames",
+    "inputs",
+    "interchange",
+    "number_format",
+    "pictures",
+    "planning",
+    "pooled_units",
+    "poses",
+    "rounding",
+    "synthetic",
+    "text",
+    "uncertainty",
+    "units",
+)
+_NAMES = {
+    "triaxcal.api": (
+        "Diagnosis",
+        "PlannedPose",
+        "Poses",
+        "Verification",
+        "budget",
+        "calibrate",
+        "diagnose",
+        "find_poses",
+        "plan",
+        "rezero",
+        "verify",
+    ),
+    "triaxcal.arrays": (
+        "Floats",
+        "Ints",
+    ),
+    "triaxcal.documents": ("Calibration",),
+    "triaxcal.errors": (
+        "InvalidData",
+        "MissingChannel",
+        "Refused",
+        "TooShort",
+        "TriaxcalError",
+    ),
+    "triaxcal.model.gravity": (
+        "HEIGHTS_M",
+        "local_gravity_g",
+    ),
+    "triaxcal.model.samples": (
+        "Moment",
+        "Samples",
+    ),
+    "triaxcal.model.sensor": ("Sensor",),
+    "triaxcal.poses.pose": (
+        "Pose",
+        "StillSpan",
+    ),
+    "triaxcal.progress": ("Stage",),
+    "triaxcal.uncertainty": ("Stated",),
 }
+_WHERE = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
+    "HEIGHTS_M",
     "Calibration",
     "Diagnosis",
+    "Floats",
+    "Ints",
     "InvalidData",
     "MissingChannel",
+    "Moment",
     "PlannedPose",
     "Pose",
     "Poses",
     "Refused",
+    "Samples",
+    "Sensor",
+    "Stage",
     "Stated",
+    "StillSpan",
+    "TooShort",
     "TriaxcalError",
     "Verification",
     "__version__",
     "budget",
     "calibrate",
     "diagnose",
+    "diagnosis",
+    "distributions",
+    "documents",
+    "effects",
+    "estimate",
+    "evidence",
     "find_poses",
+    "frames",
+    "inputs",
+    "interchange",
+    "local_gravity_g",
+    "number_format",
+    "pictures",
     "plan",
+    "planning",
+    "pooled_units",
+    "poses",
     "rezero",
+    "rounding",
+    "synthetic",
+    "text",
+    "uncertainty",
+    "units",
     "verify",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version  # as slow to import as numpy's half
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
 
-        return version("triaxcal")
-    if name not in _WHERE:
-        raise AttributeError(f"module 'triaxcal' has no attribute '{name}'")
-    from importlib import import_module
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from importlib.metadata import version  # as slow to import as numpy's half
 
-    found = getattr(import_module(_WHERE[name]), name)
-    globals()[name] = found
-    return found
+            return version("triaxcal")
+        if name in _ROOMS:
+            return import_module(f"triaxcal.{name}")
+        if name not in _WHERE:
+            raise AttributeError(f"module 'triaxcal' has no attribute '{name}'")
+        found = getattr(import_module(_WHERE[name]), name)
+        globals()[name] = found
+        return found
 
 
 def __dir__() -> list[str]:

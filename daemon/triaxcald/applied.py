@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.documents import OUT, UNCERTAINTY, Calibration
-from triaxcal.errors import MissingChannel
-from triaxcal.number_format import number_of
-from triaxcal.poses.covariates import InStream
+import triaxcal as tc
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
 from triaxcald.decoded import DecodedStream
@@ -45,7 +42,7 @@ class Applied:
 
 
 def applied(
-    calibration: Calibration,
+    calibration: tc.Calibration,
     name: str,
     *,
     uncertainty: bool = False,
@@ -74,7 +71,9 @@ def applied(
             calibration.require_whole((samples.time_ns - samples.time_ns[0]) * 1e-9)
         found.start_ns, found.remarks = 0, table.remarks
         if samples.duplicates:
-            found.remarks += (f"{number_of(samples.duplicates, 'row')} left out, the same as the one before",)
+            found.remarks += (
+                f"{tc.number_format.number_of(samples.duplicates, 'row')} left out, the same as the one before",
+            )
         pieces = iter([(samples.time_ns * 1e-9, samples.channels)])
         blocks = (
             SampleBlock(
@@ -85,10 +84,10 @@ def applied(
             )
             for at in range(0, len(samples.time_ns), BLOCK)
         )
-    followed = InStream.of(pieces, calibration.needs_recording(), calibration.duration_s)
+    followed = tc.poses.InStream.of(pieces, calibration.needs_recording(), calibration.duration_s)
     if derived := ", ".join(followed.covariates):
         found.remarks += (f"{derived}: of the recording's own channels and times, where it logs none",)
-    columns = OUT + UNCERTAINTY * uncertainty
+    columns = tc.documents.OUT + tc.documents.UNCERTAINTY * uncertainty
 
     def calibrated() -> Iterator[Rows]:
         begin_ns: int | None = None
@@ -98,7 +97,7 @@ def applied(
                 begin_ns = int(block.time_ns[0])
             t_s = (block.time_ns - (begin_ns or 0)) * 1e-9
             with warnings.catch_warnings(record=True) as told:
-                warnings.simplefilter("always", MissingChannel)
+                warnings.simplefilter("always", tc.MissingChannel)
                 a = calibration.apply(
                     block.readings,
                     t=t_s if own_recording else None,
@@ -132,7 +131,7 @@ def _renamed(held: Mapping[str, Any], taken: tuple[str, ...]) -> dict[str, Any]:
     return found
 
 
-def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) -> list[str]:
+def _of_another_unit(calibration: tc.Calibration, name: str, lengths: list[float]) -> list[str]:
     """A line where the magnitude, in the median of each block, is nowhere near
     the reference."""
     reference, unit = calibration.fitted.reference, calibration.reference_unit

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.model.directions import cube_directions
-from triaxcal.poses.pose import Pose
+import triaxcal as tc
 from triaxcal_drivers.files import read_whole
 from triaxcald.errors import InputError
 
@@ -29,7 +27,7 @@ class Row:
 
     line: int
     name: str
-    up: Floats
+    up: tc.Floats
     start_s: float | None = None
     end_s: float | None = None
 
@@ -114,8 +112,8 @@ def _number(where: str, field: str, text: str) -> float:
     return value
 
 
-def _labelled(where: str, label: str) -> Floats:
-    known: Mapping[str, Floats] = dict(cube_directions())
+def _labelled(where: str, label: str) -> tc.Floats:
+    known: Mapping[str, tc.Floats] = dict(tc.planning.cube_directions())
     try:
         return known[label.upper().replace("−", "-")]
     except KeyError:
@@ -124,7 +122,9 @@ def _labelled(where: str, label: str) -> Floats:
         ) from None
 
 
-def match(rows: Sequence[Row], poses: Sequence[Pose], *, path: str, recording: str) -> tuple[list[Pose], list[Row]]:
+def match(
+    rows: Sequence[Row], poses: Sequence[tc.Pose], *, path: str, recording: str
+) -> tuple[list[tc.Pose], list[Row]]:
     """The poses that have a row, and their rows: by time where the file has
     times, else in order.
 
@@ -157,13 +157,13 @@ def match(rows: Sequence[Row], poses: Sequence[Pose], *, path: str, recording: s
     return [poses[i] for i in kept], [owner[i] for i in kept]
 
 
-def _shared(row: Row, pose: Pose) -> float:
+def _shared(row: Row, pose: tc.Pose) -> float:
     assert row.start_s is not None
     assert row.end_s is not None
     return min(row.end_s, pose.end_s) - max(row.start_s, pose.start_s)
 
 
-def _found(poses: Sequence[Pose]) -> str:
+def _found(poses: Sequence[tc.Pose]) -> str:
     if not poses:
         return ""
     spans = ", ".join(f"{p.start_s:.1f}–{p.end_s:.1f}" for p in poses[:TOLD_MOST])

@@ -16,21 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal import text
-from triaxcal.arrays import Floats
-from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.effects import Effect
-from triaxcal.effects.runs import of_clocks
-from triaxcal.estimate.calibration import Calibration, Residual
-from triaxcal.estimate.projected_calibration import Reduced, reduced
-from triaxcal.inputs.bias_update import Earlier, updated_biases
-from triaxcal.interchange.calibration_document import Document, budget_document, holds_of
-from triaxcal.model.sensor import Sensor
-from triaxcal.number_format import micro_g
-from triaxcal.poses.covariates import channels_of, with_scale
-from triaxcal.poses.pose import Pose
-from triaxcal.rounding import error, number
-from triaxcal.uncertainty import Stated, budget
+import triaxcal as tc
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcal_drivers.roles import (
     AXES,
@@ -62,20 +48,20 @@ class Certified:
     (None where the device has none). It stands on a ``loop``, or on an earlier
     calibration ``updated`` by a few poses."""
 
-    document: Document
-    loop: Loop | None
+    document: tc.interchange.Document
+    loop: tc.diagnosis.Loop | None
     image: RegisterImage | None
     within_limits: bool
-    updated: Calibration | None = None
+    updated: tc.estimate.Calibration | None = None
 
     @property
-    def calibration(self) -> Calibration:
+    def calibration(self) -> tc.estimate.Calibration:
         found = self.loop.after if self.loop is not None else self.updated
         assert found is not None
         return found
 
     @property
-    def before(self) -> Residual:
+    def before(self) -> tc.estimate.Residual:
         """Of the linear model, or of the earlier calibration in these poses."""
         if self.loop is not None:
             return self.loop.before.residual
@@ -88,14 +74,14 @@ def certify(
     station: StationFile,
     station_text: bytes,
     pipeline: Pipeline,
-    poses: list[Pose],
+    poses: list[tc.Pose],
     digest: RawDigest,
     *,
     unit_name: str,
     serial: str | None,
     signs: tuple[int, int, int],
     computed_with: Mapping[str, str],
-    earlier: Earlier | None = None,
+    earlier: tc.inputs.Earlier | None = None,
 ) -> Certified:
     """``computed_with``: `software` of the station, so that an audit years
     later can get the same bytes. ``earlier``: the calibration of which the
@@ -106,10 +92,10 @@ def certify(
     compute_with_one_thread()
     loop = updated = None
     if earlier is None:
-        loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
+        loop = tc.diagnosis.diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
         after = loop.after
     else:
-        after = updated = updated_biases(poses, earlier)
+        after = updated = tc.inputs.updated_biases(poses, earlier)
     profile = bundle.profile
     stated = station.stated(profile)
     measured_ns = pipeline.first_host_ns or 0
@@ -125,7 +111,7 @@ def certify(
             loop, data_quality=quality, output_unit=output_unit, stated=stated, held_by_device=beside
         )
     outside = over_limits(result["after"], station.limits)
-    document: Document = {
+    document: tc.interchange.Document = {
         "format": "triaxcal.certificate/1",
         "unit": {
             "name": unit_name,
@@ -138,13 +124,15 @@ def certify(
         "recording": {
             "raw_sha256": digest.hexdigest(),
             "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
-            "seconds": number(pipeline.seconds),
+            "seconds": tc.rounding.number(pipeline.seconds),
             "poses": len(poses),
             **pipeline.counts,
         },
         "software": dict(computed_with),
-        "settings": {"signs": list(signs), "reference": number(station.reference)},
-        "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
+        "settings": {"signs": list(signs), "reference": tc.rounding.number(station.reference)},
+        "limits": {
+            k: tc.rounding.number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v
+        },
         "verdict": verdict_of(outside, station.limits),
         "outside": outside,
         "result": result,
@@ -154,7 +142,7 @@ def certify(
     return Certified(document, loop, image, not outside, updated)
 
 
-def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:
+def roles(sensor: tc.Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:
     """A sensor's coefficients by register role."""
     out = {
         f"{name}.{axis}": float(values[i])
@@ -182,30 +170,30 @@ class HeldByDevice:
     holds. ``beside_process`` is the same beside what belongs to the recording
     and not to the unit, in the recording's own poses."""
 
-    registers: Reduced
-    beside_process: Calibration
+    registers: tc.estimate.Reduced
+    beside_process: tc.estimate.Calibration
 
 
 def held_by_device(
-    profile: Profile, full: Calibration, logged: Mapping[str, Floats] | None = None
+    profile: Profile, full: tc.estimate.Calibration, logged: Mapping[str, tc.Floats] | None = None
 ) -> HeldByDevice | None:
     """None where the device cannot take a calibration at all. ``logged`` as
     `triaxcal.estimate.projected_calibration.reduced` has it."""
     if why_not_written(profile):
         return None
 
-    def has(effect: Effect) -> bool:
+    def has(effect: tc.effects.Effect) -> bool:
         return all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
 
-    beside = reduced(full, lambda effect: has(effect) or is_passing(effect), logged).calibration
-    return HeldByDevice(reduced(full, has, logged), beside)
+    beside = tc.estimate.reduced(full, lambda effect: has(effect) or is_passing(effect), logged).calibration
+    return HeldByDevice(tc.estimate.reduced(full, has, logged), beside)
 
 
-def image_of(profile: Profile, registers: Calibration, date_days: int) -> RegisterImage:
+def image_of(profile: Profile, registers: tc.estimate.Calibration, date_days: int) -> RegisterImage:
     """Of the coefficients as they are printed, so that the words follow from
     the document. Raises RegisterValueError where a value does not go into its
     register."""
-    wanted = {role: number(v) for role, v in roles(registers.sensor, registers.channel_reference).items()}
+    wanted = {role: tc.rounding.number(v) for role, v in roles(registers.sensor, registers.channel_reference).items()}
     return build_image(
         profile, {r: v for r, v in wanted.items() if v is not None and profile.by_role(r)}, date_days=date_days
     )
@@ -229,8 +217,8 @@ def with_registers(
 
 
 def _registers_document(
-    image: RegisterImage, held: HeldByDevice, full: Calibration, poses: list[Pose], stated: Stated
-) -> Document:
+    image: RegisterImage, held: HeldByDevice, full: tc.estimate.Calibration, poses: list[tc.Pose], stated: tc.Stated
+) -> tc.interchange.Document:
     registers = held.registers.calibration
     in_registers = list(registers.terms)
     host = [name for name in full.terms if name not in in_registers]
@@ -238,19 +226,20 @@ def _registers_document(
         "terms": in_registers,
         "left_to_host": host,
         "holds": registers_hold(registers, full),
-        "rms_g": error(held.beside_process.residual.rms_g),
-        "cost_rms_g": error(held.registers.cost),
-        "rounding_rms_g": error(rounding_cost(image, registers, poses)),
-        "uncertainty": budget_document(
-            registers, budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost))
+        "rms_g": tc.rounding.error(held.beside_process.residual.rms_g),
+        "cost_rms_g": tc.rounding.error(held.registers.cost),
+        "rounding_rms_g": tc.rounding.error(rounding_cost(image, registers, poses)),
+        "uncertainty": tc.interchange.budget_document(
+            registers,
+            tc.uncertainty.budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost)),
         ),
         "words": [
             {
                 "register": w.register,
                 "role": w.role,
                 "raw": w.raw.hex(),
-                "wanted": number(w.value),
-                "held": number(w.held),
+                "wanted": tc.rounding.number(w.value),
+                "held": tc.rounding.number(w.held),
                 "unit": w.unit,
             }
             for w in image.words
@@ -258,19 +247,19 @@ def _registers_document(
     }
 
 
-def registers_hold(registers: Calibration, full: Calibration) -> list[str]:
+def registers_hold(registers: tc.estimate.Calibration, full: tc.estimate.Calibration) -> list[str]:
     """Under which conditions the linear part of the registers is all of a
     reading, where ``full`` has effects of time: at their moment."""
-    timed = any(of_clocks(effect) for effect, _ in full.sensor.effects)
-    moment = [text.as_at(full.holds_at)] if timed and full.holds_at is not None else []
-    return [*moment, *holds_of(registers)]
+    timed = any(tc.effects.of_clocks(effect) for effect, _ in full.sensor.effects)
+    moment = [tc.text.as_at(full.holds_at)] if timed and full.holds_at is not None else []
+    return [*moment, *tc.interchange.holds_of(registers)]
 
 
 def _steps(image: RegisterImage) -> dict[str, float]:
     return {word.role: word.step for word in image.words}
 
 
-def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:
+def rounding_cost(image: RegisterImage, held: tc.estimate.Calibration, poses: list[tc.Pose]) -> float:
     """rms change of |a| in the poses, in g, that rounding the coefficients to
     their registers makes."""
     rounded = {w.role: w.held for w in image.words}
@@ -279,18 +268,20 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
     def triple(name: str, values: Any) -> Any:
         return np.array([rounded.get(f"{name}.{axis}", float(values[i])) for i, axis in enumerate("xyz")])
 
-    def of_effect(effect: Effect, values: Any) -> Any:
+    def of_effect(effect: tc.effects.Effect, values: Any) -> Any:
         pairs = zip(effect.coefficients, values, strict=True)
         return np.array([rounded.get(f"{effect.name}.{c.name}", float(v)) for c, v in pairs])
 
-    worse = Sensor(
+    worse = tc.Sensor(
         triple(SCALE_FACTOR, sensor.scale_factor),
         triple(MISALIGNMENT, sensor.misalignment),
         triple("bias", sensor.bias),
         tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
     )
     u = np.array([p.mean for p in poses])
-    channels = with_scale(channels_of(poses, held.channel_reference), poses, sensor.scale_factor, sensor.bias)
+    channels = tc.poses.with_scale(
+        tc.poses.channels_of(poses, held.channel_reference), poses, sensor.scale_factor, sensor.bias
+    )
     reference = dict(held.channel_reference)
     covariates = {n: channels[n] - v for n, v in reference.items()}
     if TEMPERATURE in reference and REFERENCE_ROLE in rounded:
@@ -322,6 +313,7 @@ def exceeded(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
 def over_limits(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
     """A line for each figure that is above its limit, or that is not known."""
     return [
-        f"{name} {micro_g(measured.get(name))} is above the limit {micro_g(getattr(limits, name))}"
+        f"{name} {tc.number_format.micro_g(measured.get(name))} is above the limit "
+        f"{tc.number_format.micro_g(getattr(limits, name))}"
         for name in exceeded(measured, limits)
     ]

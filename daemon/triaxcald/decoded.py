@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.arrays import READING_MOST
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle
@@ -34,7 +33,7 @@ _CALLED = {
 def only_finite(block: SampleBlock) -> SampleBlock:
     """Without the samples that hold no reading: a float register, or a message,
     may hold NaN or rubbish."""
-    finite = np.asarray((np.abs(block.readings) < READING_MOST).all(axis=1))
+    finite = np.asarray((np.abs(block.readings) < tc.poses.READING_MOST).all(axis=1))
     return block if finite.all() else replace(block.only(finite), not_finite=int((~finite).sum()))
 
 
@@ -125,7 +124,7 @@ class DecodedStream:
 def beside_samples(counts: Mapping[str, int]) -> list[str]:
     """What else was counted of a stream, by kind."""
     return [
-        number_of(n, _COUNTED[kind]) if kind in _COUNTED else f"{n} {_CALLED.get(kind, kind)}"
+        tc.number_format.number_of(n, _COUNTED[kind]) if kind in _COUNTED else f"{n} {_CALLED.get(kind, kind)}"
         for kind, n in counts.items()
         if n and kind != "samples"
     ]

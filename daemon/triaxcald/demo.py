@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.evidence.prior import Odds
+import triaxcal as tc
 from triaxcald.errors import INTERRUPTED, InputError
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
@@ -163,5 +163,5 @@ def _kept(check: Verification | None) -> bool:
 def _found(unit: SimulatedUnit, outcome: Outcome) -> bool:
     if outcome.certified is None or outcome.certified.loop is None:
         return False
-    likely = {name for name, p in outcome.certified.loop.probabilities.items() if p >= Odds().reported}
+    likely = {name for name, p in outcome.certified.loop.probabilities.items() if p >= tc.evidence.Odds().reported}
     return likely == set(unit.truth)

@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from triaxcal.diagnosis import Loop
-from triaxcal.effects import CATALOGUE, Effect
-from triaxcal.effects.contract import BEFORE, CLOCKS, DERIVED, rate_of
-from triaxcal.estimate.calibration import Calibration, Residual
-from triaxcal.uncertainty import SENSITIVITY_PER_K
+import triaxcal as tc
 
 UNIT = "unit"
 """Under ``doubts``: recordings, or a calibration and a recording, may not be of
@@ -32,7 +28,9 @@ def assumption(effects: Collection[str], reference_unit: str = "g") -> str:
         "temperature_bias": f"bias {{:g}} {'µg/K' if reference_unit == 'g' else 'ppm of the reference per K'}",
         "temperature_scale_factor": "scale factor {:g} ppm/K",
     }
-    assumed = " and ".join(text.format(1e6 * SENSITIVITY_PER_K[e]) for e, text in said.items() if e in effects)
+    assumed = " and ".join(
+        text.format(1e6 * tc.uncertainty.SENSITIVITY_PER_K[e]) for e, text in said.items() if e in effects
+    )
     if not assumed:
         return ""
     return (
@@ -45,7 +43,9 @@ def none_could_show(blind_to: Collection[str]) -> bool:
     """Whether a search that found nothing could hardly find anything: no effect
     that goes with direction or time, which every recording has, shows in
     full."""
-    return {e.name for e in CATALOGUE if set(e.needs) <= {*CLOCKS, *BEFORE}} <= set(blind_to)
+    return {e.name for e in tc.effects.CATALOGUE if set(e.needs) <= {*tc.effects.CLOCKS, *tc.effects.BEFORE}} <= set(
+        blind_to
+    )
 
 
 # What each way of correcting a unit leaves: the linear model alone, its registers,
@@ -64,10 +64,10 @@ class Choice:
 
     corrected_by: tuple[str, ...]
     terms: tuple[str, ...]
-    residual: Residual
+    residual: tc.estimate.Residual
 
 
-def choices_of(loop: Loop, held: Calibration | None = None) -> tuple[Choice, ...]:
+def choices_of(loop: tc.diagnosis.Loop, held: tc.estimate.Calibration | None = None) -> tuple[Choice, ...]:
     """From the least to the most. ``held`` is the calibration that the device
     has registers for, None without one: then the host corrects everything, the
     linear part too."""
@@ -85,11 +85,12 @@ def choices_of(loop: Loop, held: Calibration | None = None) -> tuple[Choice, ...
     return tuple(out)
 
 
-def is_passing(effect: Effect) -> bool:
+def is_passing(effect: tc.effects.Effect) -> bool:
     """Whether an effect is the recording's rather than the unit's, so that no
     register could hold it."""
-    return bool(effect.needs) and all(n in DERIVED or n.endswith(rate_of("")) for n in effect.needs)
+    rate = tc.effects.rate_of("")
+    return bool(effect.needs) and all(n in tc.effects.DERIVED or n.endswith(rate) for n in effect.needs)
 
 
-def _of_unit(c: Calibration) -> tuple[str, ...]:
+def _of_unit(c: tc.estimate.Calibration) -> tuple[str, ...]:
     return ("linear", *(effect.name for effect, _ in c.sensor.effects if not is_passing(effect)))

@@ -10,11 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from triaxcal.documents import Calibration, earlier_of
-from triaxcal.effects.contract import channel_of, is_derived
-from triaxcal.errors import Refused
-from triaxcal.inputs.bias_update import Earlier, require_known
-from triaxcal.units import same_unit
+import triaxcal as tc
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import document_bytes, parse_document
 from triaxcald.provision.identity import same_serial
@@ -34,7 +30,7 @@ class EarlierFile:
     name: str
     data: bytes
     document: Mapping[str, Any]
-    calibration: Calibration
+    calibration: tc.Calibration
 
     @classmethod
     def read(cls, path: str) -> EarlierFile:
@@ -44,7 +40,7 @@ class EarlierFile:
     @classmethod
     def parsed(cls, data: bytes, name: str) -> EarlierFile:
         document = parse_document(data, where=name)
-        return cls(Path(name).name, data, document, Calibration.from_dict(document, where=name))
+        return cls(Path(name).name, data, document, tc.Calibration.from_dict(document, where=name))
 
     @property
     def serial(self) -> str | None:
@@ -53,10 +49,10 @@ class EarlierFile:
         serial = unit.get("serial") if isinstance(unit, Mapping) else None
         return serial if isinstance(serial, str) and serial else None
 
-    def known(self, recording: str = "") -> Earlier:
+    def known(self, recording: str = "") -> tc.inputs.Earlier:
         """What it says of the unit before a ``recording``."""
         digest = hashlib.sha256(self.data).hexdigest()
-        return earlier_of(self.calibration, self.name, sha256=digest, recording=recording)
+        return tc.documents.earlier_of(self.calibration, self.name, sha256=digest, recording=recording)
 
     def require_of(
         self,
@@ -73,25 +69,27 @@ class EarlierFile:
         both say."""
         c = self.calibration
         if serial and self.serial and not same_serial(self.serial, serial):
-            raise Refused(f"{self.name}: is of the unit with serial {self.serial}; {what} is of {serial}")
+            raise tc.Refused(f"{self.name}: is of the unit with serial {self.serial}; {what} is of {serial}")
         for axis, k, sign in zip("xyz", c.scale_factor, signs or (), strict=bool(signs)):
             if k * sign < 0:
-                raise Refused(f"{self.name}: scale_factor.{axis} is {k:.4g}, of another sign than that of {what}")
+                raise tc.Refused(f"{self.name}: scale_factor.{axis} is {k:.4g}, of another sign than that of {what}")
         own = c.fitted.reference
         if reference is not None and not math.isclose(reference, own, rel_tol=1e-9):
-            raise Refused(f"{self.name}: was made for the reference {own:.9g}, and that of {what} is {reference:.9g}")
-        if reference_unit and not same_unit(reference_unit, c.reference_unit):
-            raise Refused(
+            raise tc.Refused(
+                f"{self.name}: was made for the reference {own:.9g}, and that of {what} is {reference:.9g}"
+            )
+        if reference_unit and not tc.units.same_unit(reference_unit, c.reference_unit):
+            raise tc.Refused(
                 f"{self.name}: the reference is in {c.reference_unit}, and that of {what} in {reference_unit}"
             )
-        if output_unit and c.output_unit and not same_unit(output_unit, c.output_unit):
-            raise Refused(f"{self.name}: is of outputs in {c.output_unit}, and those of {what} are in {output_unit}")
+        if output_unit and c.output_unit and not tc.units.same_unit(output_unit, c.output_unit):
+            raise tc.Refused(f"{self.name}: is of outputs in {c.output_unit}, and those of {what} are in {output_unit}")
 
     def require_of_place(self, place: Place, reference: float, serial: str | None) -> None:
         """The same of a unit of a station, whose ``reference`` is in g; and
         where it does not say how uncertain it is, or needs a channel that the
         unit does not send."""
-        require_known(self.known())
+        tc.inputs.require_known(self.known())
         self.require_of(
             f"unit {place.unit.name}",
             serial=serial,
@@ -101,9 +99,11 @@ class EarlierFile:
             output_unit=place.bundle.profile.output.unit,
         )
         sent = getattr(place.bundle.profile.streams[READINGS], "channels", None)
-        needed = [channel_of(n) for n in self.calibration.fitted.channel_reference if not is_derived(n)]
+        needed = [
+            tc.effects.channel_of(n) for n in self.calibration.fitted.channel_reference if not tc.effects.is_derived(n)
+        ]
         if sent is not None and (missing := [name for name in needed if name not in sent]):
-            raise Refused(f"{self.name}: needs {', '.join(missing)}, which unit {place.unit.name} does not send")
+            raise tc.Refused(f"{self.name}: needs {', '.join(missing)}, which unit {place.unit.name} does not send")
 
 
 def earlier_by_unit(paths: Sequence[str], station: Station) -> dict[str, EarlierFile]:
@@ -120,13 +120,13 @@ def earlier_by_unit(paths: Sequence[str], station: Station) -> dict[str, Earlier
         for file in files:
             places = [p for p in station.places if _is_of(file, p)]
             if len(places) != 1 or places[0].unit.name in found:
-                raise Refused(
+                raise tc.Refused(
                     f"{file.name}: is not of one unit of {station.path} alone by its serial number "
                     f"({file.serial or 'none'}); of several units each has its own file"
                 )
             found[places[0].unit.name] = file
         if lacking := [p.unit.name for p in station.places if p.unit.name not in found]:
-            raise Refused(f"{station.path}: no calibration to renew the biases of: {', '.join(lacking)}")
+            raise tc.Refused(f"{station.path}: no calibration to renew the biases of: {', '.join(lacking)}")
     for place in station.places:
         found[place.unit.name].require_of_place(place, station.file.reference, place.unit.serial)
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import ClassVar
 
-from triaxcal.errors import InvalidData, Refused, TriaxcalError
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError, DriverMissing, LogError, ProfileError, RegisterValueError
 from triaxcald.memory import ran_out_of_memory
 
@@ -61,7 +61,7 @@ class ProvisionError(StationError):
     """Writing to the device failed."""
 
 
-class NoPoses(Refused):
+class NoPoses(tc.Refused):
     """No new still pose came within the patience of the plan."""
 
 
@@ -92,13 +92,13 @@ def exit_code_of(e: BaseException) -> int:
     import asyncio  # 30 ms, which the start of a command does without
 
     match e:
-        case Refused() | RegisterValueError():
+        case tc.Refused() | RegisterValueError():
             return REFUSED
-        case InvalidData() | ProfileError() | DriverMissing() | LogError():
+        case tc.InvalidData() | ProfileError() | DriverMissing() | LogError():
             return BAD_INPUT
         case DaemonError():
             return e.exit_code
-        case TriaxcalError():
+        case tc.TriaxcalError():
             return REFUSED
         case asyncio.CancelledError() | KeyboardInterrupt():
             return INTERRUPTED

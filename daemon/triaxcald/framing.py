@@ -9,18 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal import text
-from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.frames.faces import LABELS, TURNS, axis_of, opposite
-from triaxcal.frames.fixture import Fixture, Quantity
-from triaxcal.frames.orientations import Verticals, verticals, verticals_under
-from triaxcal.frames.unit_frames import Frames, UnitFrame
-from triaxcal.interchange.calibration_document import Document
-from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.model.sensor import Sensor
-from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
+import triaxcal as tc
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
 
@@ -41,26 +30,28 @@ class Source:
     name: str
     measured: Measured
     calibration: str
-    sensor: Sensor
-    found: Verticals
+    sensor: tc.Sensor
+    found: tc.frames.Verticals
     output_unit: str
     reference_unit: str
-    fitted: Calibration | None = None
+    fitted: tc.estimate.Calibration | None = None
     warnings: tuple[str, ...] = ()
 
 
-def own_source(name: str, measured: Measured, fitted: Calibration, *, output_unit: str, reference_unit: str) -> Source:
+def own_source(
+    name: str, measured: Measured, fitted: tc.estimate.Calibration, *, output_unit: str, reference_unit: str
+) -> Source:
     """A unit whose calibration was fitted to the recording itself."""
     return Source(
         name,
         measured,
         "own",
         fitted.sensor,
-        verticals(fitted),
+        tc.frames.verticals(fitted),
         output_unit,
         reference_unit,
         fitted,
-        tuple(map(text.caution, fitted.cautions)),
+        tuple(map(tc.text.caution, fitted.cautions)),
     )
 
 
@@ -68,13 +59,13 @@ def source_under(
     name: str, measured: Measured, document: Mapping[str, Any], *, where: str, output_unit: str, reference_unit: str
 ) -> Source:
     """A unit with a calibration document. Raises InputError, InvalidData."""
-    sensor, channel_reference, reference = sensor_of(document, where=where)
+    sensor, channel_reference, reference = tc.interchange.sensor_of(document, where=where)
     covariance, warnings = covariance_of(document, sensor, where=where)
-    moment = holds_at_of(calibration_part(document, where=where), where=where)
+    moment = tc.interchange.holds_at_of(tc.interchange.calibration_part(document, where=where), where=where)
     absurd = f"{where}: its numbers and the readings of {measured.name} give no finite direction of up"
     try:
         with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
-            found = verticals_under(
+            found = tc.frames.verticals_under(
                 sensor,
                 measured.poses,
                 covariance,
@@ -89,21 +80,23 @@ def source_under(
     return Source(name, measured, where, sensor, found, output_unit, reference_unit, None, tuple(warnings))
 
 
-def covariance_of(document: Mapping[str, Any], sensor: Sensor, *, where: str) -> tuple[Floats, list[str]]:
+def covariance_of(document: Mapping[str, Any], sensor: tc.Sensor, *, where: str) -> tuple[tc.Floats, list[str]]:
     """(p,p) of the parameters of a calibration document, and warnings. Raises
     InputError."""
-    part = calibration_part(document, where=where)
+    part = tc.interchange.calibration_part(document, where=where)
     if "standard_error" not in part:
         count = 9 + sum(len(c) for _, c in sensor.effects)
         return np.zeros((count, count)), [f"{where} holds no standard errors: the calibration counts as exact"]
-    sigma = np.concatenate([linear_errors_of(part, where=where), effect_errors_of(part, sensor, where=where)])
-    correlation = correlation_of(part, sensor, where=where)
+    sigma = np.concatenate(
+        [tc.interchange.linear_errors_of(part, where=where), tc.interchange.effect_errors_of(part, sensor, where=where)]
+    )
+    correlation = tc.interchange.correlation_of(part, sensor, where=where)
     if correlation is None:
         return np.diag(sigma**2), [f"{where} holds no correlation: its standard errors count as independent"]
     return correlation * np.outer(sigma, sigma), []
 
 
-def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
+def frame_document(sources: Sequence[Source], frames: tc.frames.Frames) -> tc.interchange.Document:
     units = [_unit(source, unit) for source, unit in zip(sources, frames.units, strict=True)]
     pairs = [(i, j) for i in range(len(units)) for j in range(i + 1, len(units))]
     return {
@@ -114,26 +107,26 @@ def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
         "fixture": _fixture(frames.fixture),
         "agreement": {
             "agree": frames.agree,
-            "chi2": uncertainty(frames.chi2) if frames.left else None,
+            "chi2": tc.rounding.uncertainty(frames.chi2) if frames.left else None,
             "degrees_of_freedom": frames.left,
-            "p_value": probability(frames.lack_of_fit_p),
-            "inflation": uncertainty(frames.birge_ratio),
+            "p_value": tc.rounding.probability(frames.lack_of_fit_p),
+            "inflation": tc.rounding.uncertainty(frames.birge_ratio),
         },
-        "warnings": [text.caution(caution) for caution in frames.cautions],
+        "warnings": [tc.text.caution(caution) for caution in frames.cautions],
     }
 
 
 def _angles(values: Any) -> list[Any]:
     """Angles are differences of unit vectors: beyond the grid they differ from
     processor to processor."""
-    return numbers(np.round(np.asarray(values, dtype=float) / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
+    return tc.rounding.numbers(np.round(np.asarray(values, dtype=float) / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
 
 
 def _angle(value: float | None) -> float | None:
-    return None if value is None else number(round(value / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
+    return None if value is None else tc.rounding.number(round(value / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
 
 
-def _unit(source: Source, unit: UnitFrame) -> Document:
+def _unit(source: Source, unit: tc.frames.UnitFrame) -> tc.interchange.Document:
     standing, measured = unit.standing, source.measured
     factor = unit.coverage_factor()
     fitted = source.fitted
@@ -146,49 +139,57 @@ def _unit(source: Source, unit: UnitFrame) -> Document:
         "output_unit": source.output_unit,
         "reference_unit": source.reference_unit,
         **(
-            {"rms_g": uncertainty(fitted.residual.rms_g), "noise_floor_g": uncertainty(fitted.residual.noise_floor_g)}
+            {
+                "rms_g": tc.rounding.uncertainty(fitted.residual.rms_g),
+                "noise_floor_g": tc.rounding.uncertainty(fitted.residual.noise_floor_g),
+            }
             if fitted
             else {}
         ),
-        "rotation": numbers(unit.rotation),
+        "rotation": tc.rounding.numbers(unit.rotation),
         "rotation_vector_rad": _angles(unit.rotation_vector),
-        "standard_error_rad": numbers(unit.standard_error, UNCERTAINTY_DIGITS),
-        "degrees_of_freedom": numbers(unit.dof, UNCERTAINTY_DIGITS),
-        "coverage_factor": numbers(factor, UNCERTAINTY_DIGITS),
-        "expanded_rad": numbers(factor * unit.standard_error, UNCERTAINTY_DIGITS),
-        "covariance_rad2": numbers(unit.covariance, UNCERTAINTY_DIGITS),
-        "matrix_body": numbers(unit.rotation @ source.sensor.matrix),
-        "centre": numbers(source.sensor.centre),
+        "standard_error_rad": tc.rounding.numbers(unit.standard_error, tc.rounding.UNCERTAINTY_DIGITS),
+        "degrees_of_freedom": tc.rounding.numbers(unit.dof, tc.rounding.UNCERTAINTY_DIGITS),
+        "coverage_factor": tc.rounding.numbers(factor, tc.rounding.UNCERTAINTY_DIGITS),
+        "expanded_rad": tc.rounding.numbers(factor * unit.standard_error, tc.rounding.UNCERTAINTY_DIGITS),
+        "covariance_rad2": tc.rounding.numbers(unit.covariance, tc.rounding.UNCERTAINTY_DIGITS),
+        "matrix_body": tc.rounding.numbers(unit.rotation @ source.sensor.matrix),
+        "centre": tc.rounding.numbers(source.sensor.centre),
         "nearest_axes": _nearest_axes(unit.rotation),
         "mounting_assumed": standing.labelling.assumed,
         "poses": _poses(source, unit),
         "table": _table(unit),
-        "seating_error_rad": uncertainty(standing.seating),
+        "seating_error_rad": tc.rounding.uncertainty(standing.seating),
         "seating_degrees_of_freedom": standing.seating_dof,
         "data_quality": list(measured.data_quality),
-        "warnings": [*source.warnings, *map(text.caution, (*standing.labelling.cautions, *standing.cautions))],
+        "warnings": [*source.warnings, *map(tc.text.caution, (*standing.labelling.cautions, *standing.cautions))],
     }
 
 
-def _nearest_axes(rotation: Floats) -> list[str]:
+def _nearest_axes(rotation: tc.Floats) -> list[str]:
     """The body's axis nearest to each of the sensor's."""
-    nearest = TURNS[int(np.argmax(np.einsum("tij,ij->t", TURNS, rotation)))]
-    return [LABELS[int(np.argmax([axis_of(label) @ nearest[:, k] for label in LABELS]))] for k in range(3)]
+    nearest = tc.frames.TURNS[int(np.argmax(np.einsum("tij,ij->t", tc.frames.TURNS, rotation)))]
+    return [
+        tc.frames.LABELS[int(np.argmax([tc.frames.axis_of(label) @ nearest[:, k] for label in tc.frames.LABELS]))]
+        for k in range(3)
+    ]
 
 
-def _poses(source: Source, unit: UnitFrame) -> list[Document]:
+def _poses(source: Source, unit: tc.frames.UnitFrame) -> list[tc.interchange.Document]:
     labelling, found = unit.standing.labelling, source.found
     out = []
     for i, pose in enumerate(found.poses):
         label, heading = labelling.labels[i], labelling.headings[i]
         up = unit.rotation @ found.direction[i]
-        off = float(np.linalg.norm(np.cross(axis_of(label), up))) if label else None
+        off = float(np.linalg.norm(np.cross(tc.frames.axis_of(label), up))) if label else None
         out.append(
             {
-                "start_s": number(pose.start_s),
-                "end_s": number(pose.end_s),
+                "start_s": tc.rounding.number(pose.start_s),
+                "end_s": tc.rounding.number(pose.end_s),
                 "label": label,
-                "heading_deg": None if heading is None else number(float(np.degrees(heading)) % ROUND_TURN_DEG),
+                "heading_deg": None
+                if heading is None
+                else tc.rounding.number(float(np.degrees(heading)) % ROUND_TURN_DEG),
                 "up": _angles(up),
                 "from_face_rad": _angle(off),
                 "used": bool(found.used[i]),
@@ -197,18 +198,18 @@ def _poses(source: Source, unit: UnitFrame) -> list[Document]:
     return out
 
 
-def _table(unit: UnitFrame) -> Document:
+def _table(unit: tc.frames.UnitFrame) -> tc.interchange.Document:
     standing = unit.standing
     table = standing.table
     ends = [np.radians(1.0) / 2 * t.magnitude for t in standing.tilts if t.resolved]
     return {
         "tilt_rad": _angle(table.tilt),
-        "standard_error_rad": uncertainty(table.standard_error),
+        "standard_error_rad": tc.rounding.uncertainty(table.standard_error),
         "source": table.source,
         "shows": table.shows,
-        "p_value": probability(table.p_value),
+        "p_value": tc.rounding.probability(table.p_value),
         "up": None if table.vector is None else _angles(table.vector),
-        "turn_remainder_rad_per_deg": uncertainty(max(ends)) if ends else None,
+        "turn_remainder_rad_per_deg": tc.rounding.uncertainty(max(ends)) if ends else None,
         "faces": [
             {
                 "label": t.label,
@@ -216,37 +217,40 @@ def _table(unit: UnitFrame) -> Document:
                 "poses": len(t.poses),
                 "tilt_rad": _angles(unit.rotation @ standing.basis[k] @ t.tilt) if t.resolved else None,
                 "magnitude_rad": _angle(t.magnitude) if t.resolved else None,
-                "standard_error_rad": uncertainty(t.standard_error) if t.resolved else None,
+                "standard_error_rad": tc.rounding.uncertainty(t.standard_error) if t.resolved else None,
             }
             for k, t in enumerate(standing.tilts)
         ],
     }
 
 
-def _between(sources: Sequence[Source], frames: Frames, i: int, j: int) -> Document:
+def _between(sources: Sequence[Source], frames: tc.frames.Frames, i: int, j: int) -> tc.interchange.Document:
     vector, covariance = frames.between(i, j)
     return {
         "from": sources[i].name,
         "to": sources[j].name,
-        "rotation": numbers(frames.units[j].rotation.T @ frames.units[i].rotation),
+        "rotation": tc.rounding.numbers(frames.units[j].rotation.T @ frames.units[i].rotation),
         "rotation_vector_rad": _angles(vector),
-        "standard_error_rad": numbers(np.sqrt(np.maximum(np.diag(covariance), 0.0)), UNCERTAINTY_DIGITS),
+        "standard_error_rad": tc.rounding.numbers(
+            np.sqrt(np.maximum(np.diag(covariance), 0.0)), tc.rounding.UNCERTAINTY_DIGITS
+        ),
     }
 
 
-def _fixture(fixture: Fixture) -> Document:
-    def quantity(q: Quantity) -> Document:
-        return {"value": _angle(q.value), "standard_error": uncertainty(q.standard_error)}
+def _fixture(fixture: tc.frames.Fixture) -> tc.interchange.Document:
+    def quantity(q: tc.frames.Quantity) -> tc.interchange.Document:
+        return {"value": _angle(q.value), "standard_error": tc.rounding.uncertainty(q.standard_error)}
 
     return {
         "faces": [
             {
-                "face": opposite(label),
+                "face": tc.frames.opposite(label),
                 "up": label,
                 "normal": _angles(-fixture.up[k]),
                 "error_rad": _angles(-fixture.error[k]),
-                "standard_error_rad": numbers(
-                    np.where(fixture.standard_error[k] > GRID_RAD, fixture.standard_error[k], 0.0), UNCERTAINTY_DIGITS
+                "standard_error_rad": tc.rounding.numbers(
+                    np.where(fixture.standard_error[k] > GRID_RAD, fixture.standard_error[k], 0.0),
+                    tc.rounding.UNCERTAINTY_DIGITS,
                 ),
             }
             for k, label in enumerate(fixture.faces)
@@ -254,5 +258,7 @@ def _fixture(fixture: Fixture) -> Document:
         "independent_errors": 2 * len(fixture.faces) - 3,
         "squareness_rad": {axes: quantity(q) for axes, q in fixture.squareness.items()},
         "parallelism_rad": {axis: [quantity(q) for q in both] for axis, both in fixture.parallelism.items()},
-        "datum_standard_error_rad": None if fixture.offset is None else numbers(fixture.offset, UNCERTAINTY_DIGITS),
+        "datum_standard_error_rad": None
+        if fixture.offset is None
+        else tc.rounding.numbers(fixture.offset, tc.rounding.UNCERTAINTY_DIGITS),
     }

@@ -12,18 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.documents import Calibration
-from triaxcal.effects import TEMPERATURE
-from triaxcal.errors import InvalidData, TooShort
-from triaxcal.estimate.poses_from_means import poses_of_means
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.model.samples import Moment
-from triaxcal.number_format import number_of
-from triaxcal.poses.finder import PoseFinder
-from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.windows import Windows
-from triaxcal.uncertainty import Stated
-from triaxcal.units import same_unit
+import triaxcal as tc
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.files import TooLarge, read_whole, special_kind
 from triaxcal_drivers.hints import clipped
@@ -65,18 +54,18 @@ class Measured:
     """
 
     name: str
-    poses: list[Pose]
-    windows: Windows | None
+    poses: list[tc.Pose]
+    windows: tc.poses.Windows | None
     data_quality: list[str]
     profile: Profile | None = None
     signs: tuple[int, int, int] | None = None
     reference: float | None = None
     unit: Mapping[str, str] | None = None
-    stated: Stated | None = None
-    holds_at: Moment | float | None = None
+    stated: tc.Stated | None = None
+    holds_at: tc.Moment | float | None = None
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
-    too_short: TooShort | None = None
+    too_short: tc.TooShort | None = None
     unconfirmed: str = ""
     parted: Callable[[float | None], Measured] | None = None
 
@@ -86,7 +75,7 @@ def measure(
     *,
     phase: Phase = CALIBRATION,
     stream: str = READINGS,
-    moments: Moments | None = None,
+    moments: tc.inputs.Moments | None = None,
     reading: Reading | None = None,
     turn_s: float | None = None,
 ) -> Measured:
@@ -106,15 +95,15 @@ def measure(
     samples = table.samples
     if reading is not None and reading.pose_means:
         return _of_means(name, table)
-    finder = PoseFinder()
+    finder = tc.poses.PoseFinder()
     try:
         finder.feed(samples.time_ns, samples.readings, samples.channels)
         finder.finish()
         if finder.windows is None and (too_short := finder.too_short()) is not None:
             raise too_short
         if moments is not None:
-            moments.feed(samples.readings, samples.channels.get(TEMPERATURE))
-    except InvalidData as e:
+            moments.feed(samples.readings, samples.channels.get(tc.effects.TEMPERATURE))
+    except tc.InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
     read = Measured(
@@ -131,10 +120,10 @@ def measure(
     return parted(turn_s)
 
 
-def require_same_outputs(calibration: Calibration, name: str, unit: str) -> None:
+def require_same_outputs(calibration: tc.Calibration, name: str, unit: str) -> None:
     """Raises InputError where the outputs of the recording ``name`` are in
     another ``unit`` than those that were calibrated, as far as both say."""
-    if unit and calibration.output_unit and not same_unit(unit, calibration.output_unit):
+    if unit and calibration.output_unit and not tc.units.same_unit(unit, calibration.output_unit):
         raise InputError(
             f"{name}: outputs in {unit}, and the calibration is of outputs in {calibration.output_unit}; "
             "nothing is converted; --output-unit is for a table that states a wrong unit"
@@ -149,17 +138,17 @@ def _of_means(name: str, table: Table) -> Measured:
     if errors and len(errors) < len(columns):
         raise InputError(f"{name}: standard errors for {len(errors)} outputs, expected {', '.join(ERRORS)} or none")
     try:
-        poses = poses_of_means(
+        poses = tc.estimate.poses_of_means(
             table.samples.readings, table.samples.time_ns * 1e-9, np.stack(errors, axis=1) if errors else None, held
         )
-    except InvalidData as e:
+    except tc.InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     quality = [] if errors else [f"{UNKNOWN_NOISE}: told from the residuals, so that no lack of fit can show"]
     return Measured(name, poses, None, quality, output_unit=table.output_unit, remarks=table.remarks)
 
 
 def _measure_recording(
-    recording: Contents, phase: Phase, stream: str, moments: Moments | None, turn_s: float | None
+    recording: Contents, phase: Phase, stream: str, moments: tc.inputs.Moments | None, turn_s: float | None
 ) -> Measured:
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
@@ -168,7 +157,7 @@ def _measure_recording(
         used += len(batch)
         block = pipeline.rising(batch)
         if moments is not None:
-            moments.feed(block.readings, block.channels.get(TEMPERATURE))
+            moments.feed(block.readings, block.channels.get(tc.effects.TEMPERATURE))
     pipeline.close()
     lost = losses_of(recording)
     signs = signs_of(recording) or bundle.profile.output.signs
@@ -176,7 +165,7 @@ def _measure_recording(
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
         station = parse_station(recording.attachments[STATION_FILE], where=where)
-    stated = Stated(thermal_sensitivity=bundle.profile.output.thermal_sensitivity_per_k)
+    stated = tc.Stated(thermal_sensitivity=bundle.profile.output.thermal_sensitivity_per_k)
     reference, at = None, None
     if station is not None:
         reference, stated, at = station.reference, station.stated(bundle.profile), station.moment
@@ -244,7 +233,7 @@ def _mostly_unconfirmed(recording: Contents, phase: Phase, used: int) -> str:
 
 
 def _were(records: int) -> str:
-    return f"{number_of(records, 'record')} {'was' if records == 1 else 'were'}"
+    return f"{tc.number_format.number_of(records, 'record')} {'was' if records == 1 else 'were'}"
 
 
 def samples_of(recording: Contents, phases: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:

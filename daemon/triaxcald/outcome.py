@@ -11,7 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from triaxcal.interchange.calibration_document import Document
+import triaxcal as tc
 from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
@@ -114,13 +114,13 @@ class Papers:
     outcome is the last part of.
     """
 
-    measured: Document | None = None
-    verification: Document | None = None
-    registers: Document | None = None
+    measured: tc.interchange.Document | None = None
+    verification: tc.interchange.Document | None = None
+    registers: tc.interchange.Document | None = None
     limits: Mapping[str, float | None] = field(default_factory=dict)
     outside: Sequence[str] = ()
     digests: Mapping[str, str | None] = field(default_factory=dict)
-    contents: Document | None = None
+    contents: tc.interchange.Document | None = None
 
 
 def outcome_document(
@@ -136,7 +136,7 @@ def outcome_document(
     supersedes: str | None,
     journal: str | None = None,
     forced: str | None = None,
-) -> Document:
+) -> tc.interchange.Document:
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
     needed, ``forced`` the reason for which doubts were overruled."""
@@ -168,7 +168,7 @@ def outcome_document(
     }
 
 
-def measured_in(certificate: Mapping[str, Any]) -> Document:
+def measured_in(certificate: Mapping[str, Any]) -> tc.interchange.Document:
     """The figures of the fit, as the certificate has them."""
     result = certificate["result"]
     return {
@@ -181,7 +181,7 @@ def measured_in(certificate: Mapping[str, Any]) -> Document:
     }
 
 
-def registers_told(p: Provisioning) -> Document:
+def registers_told(p: Provisioning) -> tc.interchange.Document:
     """What was done to the registers, and what an undoing would bring back."""
     return {
         "differing": list(p.differing),

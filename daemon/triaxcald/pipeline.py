@@ -9,13 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal import text
-from triaxcal.errors import TooShort
-from triaxcal.number_format import number_of
-from triaxcal.poses.finder import PoseFinder
-from triaxcal.poses.pose import Pose, StillSpan
-from triaxcal.poses.quality import QualityFinding, disturbances
-from triaxcal.poses.stillness.windows import Windows
+import triaxcal as tc
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
@@ -32,7 +26,7 @@ class Pipeline(DecodedStream):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._finder = PoseFinder(self.turn_s)
+        self._finder = tc.poses.PoseFinder(self.turn_s)
 
     def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
         channels = {n: v[fresh] for n, v in block.channels.items()}
@@ -44,24 +38,24 @@ class Pipeline(DecodedStream):
         return self
 
     @property
-    def windows(self) -> Windows | None:
+    def windows(self) -> tc.poses.Windows | None:
         """Summaries of the stream so far; None while there are none."""
         return self._finder.windows
 
-    def too_short(self) -> TooShort | None:
+    def too_short(self) -> tc.TooShort | None:
         """Why no pose could be found so far, whatever the unit did."""
         return self._finder.too_short()
 
-    def poses(self) -> list[Pose]:
+    def poses(self) -> list[tc.Pose]:
         """The still poses so far, whether their samples are faulty or not."""
         return self._finder.poses(judged=False)
 
-    def held(self) -> list[StillSpan]:
+    def held(self) -> list[tc.StillSpan]:
         """The same without their noise, which takes longer than all the rest:
         enough to guide an operator by."""
         return self._finder.still_spans()
 
-    def finish(self) -> list[Pose]:
+    def finish(self) -> list[tc.Pose]:
         """The still poses of the whole stream."""
         self.close()
         return self.parted(self.turn_s)
@@ -70,7 +64,7 @@ class Pipeline(DecodedStream):
         """No more records come."""
         self._finder.finish()
 
-    def parted(self, turn_s: float | None) -> list[Pose]:
+    def parted(self, turn_s: float | None) -> list[tc.Pose]:
         """The still poses of the whole stream once that is closed, for another
         ``turn_s``."""
         self._finder.part_by(turn_s)
@@ -100,7 +94,7 @@ class Pipeline(DecodedStream):
         if self.counts["out_of_order"]:
             found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:
-            found["bus_errors"] = number_of(self.counts["errors"], "record")
+            found["bus_errors"] = tc.number_format.number_of(self.counts["errors"], "record")
         if absurd := self._implausible():
             found["implausible_readings"] = absurd
         return together(found, self._finder.findings(), self.output_unit)
@@ -129,7 +123,7 @@ class Pipeline(DecodedStream):
         )
 
 
-def together(counted: Mapping[str, str], seen: Iterable[QualityFinding], unit: str = "") -> list[str]:
+def together(counted: Mapping[str, str], seen: Iterable[tc.poses.QualityFinding], unit: str = "") -> list[str]:
     """What was ``counted`` on the way here, by name, and what is ``seen`` in
     the samples, whose outputs are in ``unit``: one line for each kind of fault.
     What was counted as missing leaves the gaps that are seen, which are not
@@ -138,15 +132,15 @@ def together(counted: Mapping[str, str], seen: Iterable[QualityFinding], unit: s
     said = dict(counted)
     for finding in seen:
         if finding.name not in said:
-            said[finding.name] = text.quality(finding, unit)
+            said[finding.name] = tc.text.quality(finding, unit)
         elif finding.name != "missing_samples":
-            said[finding.name] += f"; {text.quality(finding, unit)}"
+            said[finding.name] += f"; {tc.text.quality(finding, unit)}"
     return [f"{name}: {what}" for name, what in said.items()]
 
 
-def of_poses(poses: Sequence[Pose], unit: str = "") -> list[str]:
+def of_poses(poses: Sequence[tc.Pose], unit: str = "") -> list[str]:
     """What poses are to be blamed for, likewise."""
-    said = [text.quality_line(f, unit) for f in disturbances(poses)]
+    said = [tc.text.quality_line(f, unit) for f in tc.poses.disturbances(poses)]
     if found := [p for p in poses if p.creep.any()]:
         said.append(f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s")
     return said

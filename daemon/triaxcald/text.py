@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from triaxcal.number_format import micro_g, number_of
+import triaxcal as tc
 from triaxcald.provision.state import DeviceState, Evidence, Held
 
 if TYPE_CHECKING:
@@ -49,7 +49,8 @@ def unidentified(why: str) -> str:
 
 def unconfirmed(records: int) -> str:
     return (
-        f"{number_of(records, 'record')} not used, which came after the unit was last confirmed to be there; "
+        f"{tc.number_format.number_of(records, 'record')} not used, which came after the unit was last "
+        "confirmed to be there; "
         "another one answered later"
     )
 
@@ -57,7 +58,7 @@ def unconfirmed(records: int) -> str:
 def mostly_unconfirmed(unconfirmed: int, records: int, why: str) -> str:
     """``why`` is by what another unit was noticed, where that is known."""
     return (
-        f"{unconfirmed} of {number_of(records, 'record')} are unconfirmed, and not used: "
+        f"{unconfirmed} of {tc.number_format.number_of(records, 'record')} are unconfirmed, and not used: "
         f"{why or 'another unit answered'}; record it again with the right unit alone there"
     )
 
@@ -96,7 +97,9 @@ def recorded(units: int, buses: int, lost: Sequence[str], ended: Sequence[str], 
     )
     kinds = " and ".join(kind for kind, count in (("units", units), ("buses", buses)) if count)
     there = units + buses
-    came = f"{there - len(lost) - len(ended)} of {there} {kinds} recorded, {number_of(records, 'record')}"
+    came = (
+        f"{there - len(lost) - len(ended)} of {there} {kinds} recorded, {tc.number_format.number_of(records, 'record')}"
+    )
     return f"{came}{missing}"
 
 
@@ -115,7 +118,7 @@ def not_reloaded(error: str) -> str:
 
 def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> str:
     """Where a single file is to hold what a station records."""
-    there = [number_of(len(units), "unit")] if units else []
+    there = [tc.number_format.number_of(len(units), "unit")] if units else []
     there += [f"{len(buses)} bus{'es' * (len(buses) != 1)}"] if buses else []
     return (
         f"there are {' and '.join(there)}; name one of {', '.join([*units, *buses])} with --unit, or record all of "
@@ -153,9 +156,12 @@ def own_seconds(own: float, by_host: float | None) -> str:
 def bus_recorded(name: str, counts: Mapping[str, int], seconds: float) -> str:
     """What the recording of a bus has come to; ``counts`` as
     `triaxcald.station.listening.Listened` has them."""
-    frames, identifiers = number_of(counts["frames"], "frame"), number_of(counts["identifiers"], "identifier")
+    frames, identifiers = (
+        tc.number_format.number_of(counts["frames"], "frame"),
+        tc.number_format.number_of(counts["identifiers"], "identifier"),
+    )
     came = f"{name}: {frames} of {identifiers} in {seconds:.1f} s"
-    return f"{came}, {number_of(counts['errors'], 'error frame')}" if counts["errors"] else came
+    return f"{came}, {tc.number_format.number_of(counts['errors'], 'error frame')}" if counts["errors"] else came
 
 
 def switch_supply(off_s: float) -> str:
@@ -210,12 +216,12 @@ def provisioned(p: Provisioning) -> str:
             return f"the registers in use held these values already{wrote}; no restart shows them stored"
         return f"the registers held these values already{wrote}; {held(p.held)}"
     stored = "written and stored" if p.stores else "written"
-    return f"{number_of(len(p.written), 'register')} {stored}; {held(p.held)}"
+    return f"{tc.number_format.number_of(len(p.written), 'register')} {stored}; {held(p.held)}"
 
 
 def rehearsed(p: Provisioning) -> str:
     """The same where only a dry run was asked for."""
-    there = number_of(len(p.differing), "register")
+    there = tc.number_format.number_of(len(p.differing), "register")
     if p.restart_owed:
         return (
             f"dry run: nothing was written; {there} in use {'differs' if len(p.differing) == 1 else 'differ'} from the "
@@ -226,7 +232,11 @@ def rehearsed(p: Provisioning) -> str:
 
 def put_back(p: Provisioning) -> str:
     """The same of an old calibration."""
-    done = f"{number_of(len(p.written), 'register')} written back" if p.written else "nothing had to be written"
+    done = (
+        f"{tc.number_format.number_of(len(p.written), 'register')} written back"
+        if p.written
+        else "nothing had to be written"
+    )
     return f"{done}; {held(p.held)}"
 
 
@@ -237,17 +247,17 @@ def passed(verification: Mapping[str, Any] | None) -> str:
     if verification is None:
         return "the fit is within the limits; the device's own output was not checked"
     limit = verification["limit_rms_g"]
-    told = "" if limit is None else f", limit {micro_g(limit)}"
+    told = "" if limit is None else f", limit {tc.number_format.micro_g(limit)}"
     return f"within the limits; the device's own output in {_poses(verification)} is {_checked(verification)}{told}"
 
 
 def verification_failed(verification: Mapping[str, Any]) -> str:
     limit = verification["limit_rms_g"]
     if limit is None:
-        before = micro_g(verification["before_rms_g"])
+        before = tc.number_format.micro_g(verification["before_rms_g"])
         limited = f"worse than {before} before"
     else:
-        limited = f"limit {micro_g(limit)}"
+        limited = f"limit {tc.number_format.micro_g(limit)}"
     return f"the device's own output in {_poses(verification)} is {_checked(verification)}, {limited}"
 
 
@@ -264,8 +274,8 @@ def _poses(verification: Mapping[str, Any]) -> str:
 
 def _checked(verification: Mapping[str, Any]) -> str:
     expanded = verification.get("expanded_uncertainty_g")
-    told = f" ± {micro_g(expanded)}" if expanded is not None else ""
-    return f"{micro_g(verification['after_rms_g'])}{told} off"
+    told = f" ± {tc.number_format.micro_g(expanded)}" if expanded is not None else ""
+    return f"{tc.number_format.micro_g(verification['after_rms_g'])}{told} off"
 
 
 def doubt(of: Doubt) -> str:

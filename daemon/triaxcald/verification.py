@@ -13,12 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.distributions import f_sf
-from triaxcal.interchange.calibration_document import Document
-from triaxcal.number_format import plain
-from triaxcal.poses.pose import Pose
-from triaxcal.rounding import degrees, error, number, probability, uncertainty
+import triaxcal as tc
 from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.software import compute_with_one_thread
 from triaxcald.station.guidance import ups
@@ -41,13 +36,13 @@ class Verification:
     each.
     """
 
-    poses: Sequence[Pose]
-    error_g: Floats
-    standard_error_g: Floats
+    poses: Sequence[tc.Pose]
+    error_g: tc.Floats
+    standard_error_g: tc.Floats
     data_quality: tuple[str, ...] = ()
 
     @property
-    def untrusted(self) -> list[Pose]:
+    def untrusted(self) -> list[tc.Pose]:
         return [p for p in self.poses if p.fault]
 
     @property
@@ -76,11 +71,11 @@ class Verification:
         variance = max(float(np.sum(4 * e**2 * s**2 - 2 * s**4)), float(np.sum(2 * s**4)))
         return float(np.sqrt(variance)) / (len(e) * rms_g)
 
-    def _trusted(self, values: Floats) -> Floats:
+    def _trusted(self, values: tc.Floats) -> tc.Floats:
         return np.delete(values, [i for i, p in enumerate(self.poses) if p.fault])
 
 
-def verify(poses: Sequence[Pose], reference: float) -> Verification:
+def verify(poses: Sequence[tc.Pose], reference: float) -> Verification:
     """``poses`` of the corrected stream, in units of the reference vector."""
     if not poses:
         return Verification([], np.zeros(0), np.zeros(0))
@@ -96,18 +91,18 @@ class Apart:
     """``fitted`` (n,3) are the directions of up of the fit's poses; a check
     pose ``apart_deg`` from all of them is in another attitude."""
 
-    fitted: Floats
+    fitted: tc.Floats
     apart_deg: float
 
-    def angles_deg(self, poses: Sequence[Pose]) -> Floats:
+    def angles_deg(self, poses: Sequence[tc.Pose]) -> tc.Floats:
         """(m,) from each check pose to the nearest of the fit."""
         a = np.array([p.mean for p in poses]).reshape(-1, 3)
         n = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
-        cosines: Floats = np.clip(np.max(n @ self.fitted.T, axis=1, initial=-1.0), -1.0, 1.0)
+        cosines: tc.Floats = np.clip(np.max(n @ self.fitted.T, axis=1, initial=-1.0), -1.0, 1.0)
         return np.asarray(np.degrees(np.arccos(cosines)))
 
 
-def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> Floats:
+def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> tc.Floats:
     """(n,3): the directions of up of the poses that a calibration is made of,
     to a degree or so. ``signs`` of the outputs, where the profile has no
     nominal scale factors."""
@@ -125,7 +120,7 @@ def verified(pipeline: Pipeline, reference: float) -> Verification:
     return replace(verify(poses, reference), data_quality=tuple(quality))
 
 
-def _rms(values: Floats) -> float | None:
+def _rms(values: tc.Floats) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
@@ -135,24 +130,24 @@ def unlike(name: str, rms_g: float, reference: float, said: str = "does not look
     if not rms_g > UNLIKE * reference:
         return []
     return [
-        f"{name} {said}: |a| is off by {plain(rms_g / reference, 2)} of the reference; "
+        f"{name} {said}: |a| is off by {tc.number_format.plain(rms_g / reference, 2)} of the reference; "
         "is it another unit, or are signs, order or unit of its outputs others?"
     ]
 
 
-def trust(pose: Pose) -> dict[str, Any]:
+def trust(pose: tc.Pose) -> dict[str, Any]:
     """Whether a pose counts, as it stands in documents."""
     return {"used": not pose.fault, "fault": pose.fault or None}
 
 
-def pose_rows(found: Verification, reference: float = 1.0) -> list[Document]:
+def pose_rows(found: Verification, reference: float = 1.0) -> list[tc.interchange.Document]:
     """Pose by pose, the untrusted ones among them."""
     return [
         {
-            "start_s": number(p.start_s),
-            "end_s": number(p.end_s),
-            "error_g": error(float(e), reference),
-            "standard_error_g": uncertainty(float(s)),
+            "start_s": tc.rounding.number(p.start_s),
+            "end_s": tc.rounding.number(p.end_s),
+            "error_g": tc.rounding.error(float(e), reference),
+            "standard_error_g": tc.rounding.uncertainty(float(s)),
             **trust(p),
         }
         for p, e, s in zip(found.poses, found.error_g, found.standard_error_g, strict=True)
@@ -166,7 +161,7 @@ def verdict_by_limit(rms_g: float | None, limit_g: float) -> str:
 
 def _verdict(before: Verification, after: Verification, limit_g: float | None) -> str:
     if limit_g is not None:
-        return verdict_by_limit(error(after.rms_g), limit_g)
+        return verdict_by_limit(tc.rounding.error(after.rms_g), limit_g)
     return WORSE if _is_worse(before, after) else UNJUDGED
 
 
@@ -179,11 +174,11 @@ def _is_worse(before: Verification, after: Verification) -> bool:
         return False
     expected = old**2 + max(noise**2 - floor**2, 0.0)
     count = [len(v.poses) - len(v.untrusted) for v in (after, before)]
-    p = probability(float(f_sf(new**2 / max(expected, 1e-300), *count)))
+    p = tc.rounding.probability(float(tc.distributions.f_sf(new**2 / max(expected, 1e-300), *count)))
     return p is not None and p < BY_CHANCE
 
 
-def poses_apart(rows: Sequence[Document], apart_deg: float) -> int:
+def poses_apart(rows: Sequence[tc.interchange.Document], apart_deg: float) -> int:
     """How many check poses that count are so far from all attitudes of the fit,
     by the angles as they are printed."""
     return sum(bool(row["used"]) and row["from_fit_deg"] >= apart_deg for row in rows)
@@ -191,26 +186,26 @@ def poses_apart(rows: Sequence[Document], apart_deg: float) -> int:
 
 def verification_document(
     before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str, apart: Apart
-) -> Document:
+) -> tc.interchange.Document:
     """``before``: the device's output with its old registers; ``after``: with
     the new ones, after a restart.
     """
     rms = after.rms_g
-    document: Document = {
+    document: tc.interchange.Document = {
         "format": "triaxcal.verification/1",
         "raw_sha256": raw_sha256,
-        "before_rms_g": error(before.rms_g),
-        "after_rms_g": error(rms),
-        "after_max_abs_g": error(after.max_abs_g),
-        "noise_floor_g": error(after.noise_floor_g),
-        "limit_rms_g": number(limit_g),
+        "before_rms_g": tc.rounding.error(before.rms_g),
+        "after_rms_g": tc.rounding.error(rms),
+        "after_max_abs_g": tc.rounding.error(after.max_abs_g),
+        "noise_floor_g": tc.rounding.error(after.noise_floor_g),
+        "limit_rms_g": tc.rounding.number(limit_g),
         "verdict": _verdict(before, after, limit_g),
         "poses": pose_rows(after),
         "data_quality": list(after.data_quality),
     }
     angles = apart.angles_deg(after.poses)
     for row, angle in zip(document["poses"], angles, strict=True):
-        row["from_fit_deg"] = degrees(float(angle))
-    document["expanded_uncertainty_g"] = uncertainty(after.expanded_uncertainty_g)
+        row["from_fit_deg"] = tc.rounding.degrees(float(angle))
+    document["expanded_uncertainty_g"] = tc.rounding.uncertainty(after.expanded_uncertainty_g)
     document["poses_apart"] = poses_apart(document["poses"], apart.apart_deg)
     return document

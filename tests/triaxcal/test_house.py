@@ -6,8 +6,9 @@ import ast
 import itertools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -78,6 +79,41 @@ def test_no_contract_between_the_houses_is_broken() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 broken" in done.stdout
+
+
+def test_the_daemon_takes_public_names_of_the_metrology_alone() -> None:
+    daemon = ROOT / "daemon"
+    taken = {
+        (f"{file.relative_to(daemon)}:{node.lineno}", _chain(node))
+        for file in sorted(daemon.rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Attribute) and _chain(node)[:1] == ("tc",)
+    }
+    assert len({names[1:3] for _, names in taken}) > 100
+    assert [(where, names) for where, names in sorted(taken) if not _is_public(names[1:])] == []
+
+
+def _chain(node: ast.expr) -> tuple[str, ...]:
+    """`tc.units.ErrorUnit` as its names; empty where it is anything else."""
+    if isinstance(node, ast.Name):
+        return (node.id,)
+    if isinstance(node, ast.Attribute) and (above := _chain(node.value)):
+        return (*above, node.attr)
+    return ()
+
+
+def _is_public(names: Sequence[str]) -> bool:
+    """Whether each name is one that the module before it offers: in its
+    ``__all__``, or of its own making and without an underscore."""
+    module: object = triaxcal
+    for name in names:
+        if not isinstance(module, ModuleType):
+            return True
+        offered = getattr(module, "__all__", None)
+        if name.startswith("_") or (name not in offered if offered is not None else not hasattr(module, name)):
+            return False
+        module = getattr(module, name)
+    return True
 
 
 def test_the_metrology_says_that_it_is_typed() -> None:

@@ -10,10 +10,28 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
-from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, channel_of, is_derived
+from triaxcal.effects.contract import (
+    BEFORE,
+    CHANGE,
+    CLOCKS,
+    DERIVED,
+    IN_ONE_RUN,
+    RUN,
+    SCATTER,
+    SINCE_START,
+    TIME,
+    Coefficient,
+    Effect,
+    Meaning,
+    channel_of,
+    covariate_of,
+    is_derived,
+    lag_in,
+    rate_of,
+)
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.plugins import plugins
-from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, runs_named
+from triaxcal.effects.plugins import package_of, plugins
+from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, of_clocks, runs_named
 
 TEMPERATURE = "temp_c"
 OWN: tuple[Effect, ...] = (*CATALOGUE, *BETWEEN_RUNS, Empirical())
@@ -68,4 +86,36 @@ def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
     raise KeyError(f"{name}.{next((n for n in values if n not in known), ', '.join(values))}")
 
 
-__all__ = ["CATALOGUE", "TIME", "Coefficient", "Effect", "catalogue_for", "effect_named", "effect_of"]
+__all__ = [
+    "BEFORE",
+    "BETWEEN_RUNS",
+    "BIAS",
+    "CATALOGUE",
+    "CHANGE",
+    "CLOCKS",
+    "DERIVED",
+    "IN_ONE_RUN",
+    "OWN",
+    "RUN",
+    "SCALE_FACTOR",
+    "SCATTER",
+    "SINCE_START",
+    "TEMPERATURE",
+    "TIME",
+    "Coefficient",
+    "Effect",
+    "Empirical",
+    "Meaning",
+    "catalogue_for",
+    "channel_of",
+    "covariate_of",
+    "effect_named",
+    "effect_of",
+    "is_derived",
+    "lag_in",
+    "meaning_of",
+    "of_clocks",
+    "package_of",
+    "plugins",
+    "rate_of",
+]

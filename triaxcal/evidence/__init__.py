@@ -8,12 +8,14 @@ against what went before.
 from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained, findings
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind, Advice, Expected, advice
+from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace, unit_of
 from triaxcal.evidence.pooled import Pooled, pool
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.search import posterior_of
 
 __all__ = [
+    "POSE",
     "Action",
     "ActionKind",
     "Advice",
@@ -25,7 +27,9 @@ __all__ = [
     "Odds",
     "Pooled",
     "Posterior",
+    "Quantity",
     "Refusal",
+    "Trace",
     "Unexplained",
     "advice",
     "average",
@@ -33,4 +37,5 @@ __all__ = [
     "pool",
     "posterior_of",
     "refusal",
-]  # fmt: skip
+    "unit_of",
+]

@@ -1,1 +1,21 @@
 """Other ways in: a turning unit, known attitudes, datasheet values."""
+
+from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
+from triaxcal.inputs.bias_update import Earlier, require_known, updated_biases
+from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
+from triaxcal.inputs.turning.moments import Moments
+from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
+
+__all__ = [
+    "AttitudeFit",
+    "Datasheet",
+    "Earlier",
+    "Moments",
+    "Refinement",
+    "RotationFit",
+    "fit_attitudes",
+    "fit_rotation",
+    "refine",
+    "require_known",
+    "updated_biases",
+]

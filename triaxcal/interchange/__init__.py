@@ -1,2 +1,71 @@
 """How values look to others: JSON documents written and read, and samples as
 arrays or tables."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from triaxcal.interchange.calibration_document import (
+    WEIGHT,
+    Document,
+    assumed_in,
+    budget_document,
+    calibration_document,
+    coefficients_document,
+    holds_of,
+    poses_document,
+    residual_document,
+)
+from triaxcal.interchange.calibration_reading import (
+    but_is,
+    calibration_of,
+    calibration_part,
+    expanded_uncertainty_in,
+    holds_at_of,
+    logged_in,
+    reference_unit_in,
+    sensor_of,
+)
+from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.interchange.method_documents import attitudes_document, datasheet_document, turning_document
+
+if TYPE_CHECKING:
+    from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
+
+_LATER = ("agreement_document", "with_recordings")
+"""They import the diagnosis, which most commands do without."""
+
+__all__ = [
+    "WEIGHT",
+    "Document",
+    "agreement_document",
+    "assumed_in",
+    "attitudes_document",
+    "budget_document",
+    "but_is",
+    "calibration_document",
+    "calibration_of",
+    "calibration_part",
+    "coefficients_document",
+    "correlation_of",
+    "datasheet_document",
+    "effect_errors_of",
+    "expanded_uncertainty_in",
+    "holds_at_of",
+    "holds_of",
+    "linear_errors_of",
+    "logged_in",
+    "poses_document",
+    "reference_unit_in",
+    "residual_document",
+    "sensor_of",
+    "turning_document",
+    "with_recordings",
+]
+
+
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
+
+    def __getattr__(name: str) -> Any:
+        if name not in _LATER:
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        return getattr(import_module(f"{__name__}.pooled_documents"), name)

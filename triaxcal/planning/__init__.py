@@ -1,6 +1,59 @@
 """Where to point the unit: directions, their order, designs for suspected
 effects, and what a set still lacks."""
 
-from triaxcal.model.directions import dilution, directions, in_order, most_wanted
+from triaxcal.model.bias_directions import bias_directions
+from triaxcal.model.directions import (
+    FULL,
+    LEAST,
+    PAPER,
+    Direction,
+    closed,
+    cube_directions,
+    dilution,
+    directions,
+    elsewhere,
+    in_order,
+    linear_design,
+    most_wanted,
+    worst_error,
+)
+from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
+from triaxcal.planning.design import (
+    Observability,
+    TargetEffects,
+    in_plan,
+    needs_time,
+    observability,
+    target_effects,
+    unseen_effects,
+)
+from triaxcal.planning.optimal_plan import OptimalPlan, optimal
 
-__all__ = ["dilution", "directions", "in_order", "most_wanted"]
+__all__ = [
+    "FULL",
+    "LEAST",
+    "PAPER",
+    "Addition",
+    "Direction",
+    "MissingPoses",
+    "Observability",
+    "OptimalPlan",
+    "TargetEffects",
+    "bias_directions",
+    "closed",
+    "cube_directions",
+    "dilution",
+    "directions",
+    "elsewhere",
+    "in_order",
+    "in_plan",
+    "linear_design",
+    "missing_poses",
+    "most_wanted",
+    "needs_time",
+    "observability",
+    "optimal",
+    "target_effects",
+    "unseen_effects",
+    "worst_error",
+]

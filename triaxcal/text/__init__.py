@@ -5,13 +5,47 @@ The one room that makes sentences; no other reads them back. An effect brings
 its own remedy, and an exception its own line.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.cautions import caution
 from triaxcal.text.holds import as_at, holds, use
 from triaxcal.text.quality import quality, quality_line
 from triaxcal.text.summary import html, poses, short, summary, verification
 
+if TYPE_CHECKING:
+    from triaxcal.text import advice, bias_update, diagnosis, pooled_units, traces
+
+_LATER = ("advice", "bias_update", "diagnosis", "pooled_units", "traces")
+"""Chapters that import the diagnosis, which most commands do without."""
+
 __all__ = [
-    "as_at", "basis", "caution", "holds", "html", "not_evaluated", "poses", "quality", "quality_line", "remedy",
-    "short", "summary", "use", "verification",
+    "advice",
+    "as_at",
+    "basis",
+    "bias_update",
+    "caution",
+    "diagnosis",
+    "holds",
+    "html",
+    "not_evaluated",
+    "pooled_units",
+    "poses",
+    "quality",
+    "quality_line",
+    "remedy",
+    "short",
+    "summary",
+    "traces",
+    "use",
+    "verification",
 ]  # fmt: skip
+
+
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
+
+    def __getattr__(name: str) -> Any:
+        if name not in _LATER:
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        return import_module(f"{__name__}.{name}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from math import floor, log10
 from typing import Any
 
-from triaxcal.rounding import Printed
+import triaxcal as tc
 from triaxcal_drivers.roles import LINEAR
 from triaxcald.audit.differences import SENTENCES
 
@@ -84,7 +84,7 @@ class Figures:
         if isinstance(again, list) and isinstance(stored, list) and len(again) == len(stored):
             pairs = enumerate(zip(stored, again, strict=True))
             return [self._taken(s, a, f"{at}[{i}]", key, part, agreement) for i, (s, a) in pairs]
-        if isinstance(again, Printed) and type(stored) is float and stored != again:
+        if isinstance(again, tc.rounding.Printed) and type(stored) is float and stored != again:
             uncertainty = self.uncertainties.get(at) or again.known_to
             if same_figure(stored, again, uncertainty):
                 agreement.take(f"{part}: {at}", abs(stored - again), again, uncertainty)
@@ -138,7 +138,7 @@ def furthest(stored: Any, again: Any) -> tuple[float, str] | None:
     return max(shares, default=None)
 
 
-def same_figure(stored: float, again: Printed, uncertainty: float | None) -> bool:
+def same_figure(stored: float, again: tc.rounding.Printed, uncertainty: float | None) -> bool:
     """Whether the ``stored`` figure could be the one that was computed
     ``again``."""
     if abs(stored - again) <= max(SHARE * (uncertainty or 0.0), RELATIVE * abs(again)):
@@ -239,8 +239,8 @@ def _placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:
         yield at, node
 
 
-def _printed(document: Any) -> Iterator[Printed]:
-    return (leaf for _, leaf in _placed(document) if isinstance(leaf, Printed))
+def _printed(document: Any) -> Iterator[tc.rounding.Printed]:
+    return (leaf for _, leaf in _placed(document) if isinstance(leaf, tc.rounding.Printed))
 
 
 def inside(at: str, key: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from triaxcal.errors import TriaxcalError
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError
 from triaxcald.audit.conduct import Audit, audit
 from triaxcald.errors import DONE, OUTSIDE, SEVEREST, DaemonError, InputError, exit_code_of
@@ -51,7 +51,7 @@ def worst(of: Iterable[Audited]) -> int:
 def _audited(path: Path) -> Audited:
     try:
         found = audit(path)
-    except (TriaxcalError, DriverError, DaemonError) as e:
+    except (tc.TriaxcalError, DriverError, DaemonError) as e:
         return Audited(str(path), None, str(e), exit_code_of(e))
     except Exception as e:
         if not ran_out_of_memory(e):

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from triaxcal.errors import TriaxcalError
-from triaxcal.interchange.calibration_document import Document
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.figures import Agreement, Figures
@@ -40,7 +39,7 @@ from triaxcald.verification import (
     verified,
 )
 
-CANNOT = (TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
+CANNOT = (tc.TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
 """What a changed profile, station file or raw record may end in."""
 
 
@@ -64,7 +63,7 @@ class Again:
     readings: Pipeline
     certified: Certified | None
     why_not: str
-    verification: Document | None
+    verification: tc.interchange.Document | None
     previews: Mapping[str, Thinned]
 
     @property
@@ -265,8 +264,12 @@ def report_of(again: Again, ending: Ending, held: Held) -> str:
 
 
 def outcome_again(
-    stored: Mapping[str, Any], again: Again, recording: Recording, digests_of: Mapping[str, str], contents: Document
-) -> Document:
+    stored: Mapping[str, Any],
+    again: Again,
+    recording: Recording,
+    digests_of: Mapping[str, str],
+    contents: tc.interchange.Document,
+) -> tc.interchange.Document:
     """The outcome as it follows from all the rest. What a recording cannot know
     of itself is taken as ``stored``: when it ended, which outcome it
     supersedes, why doubts were overruled, and why work was aborted."""

@@ -7,8 +7,7 @@ import gzip
 import io
 from pathlib import Path
 
-from triaxcal.documents import Calibration
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcald.applied import Applied, applied
 from triaxcald.cli.console import say
 from triaxcald.cli.showing import reading_of, warn
@@ -29,7 +28,7 @@ def apply_command(a: argparse.Namespace) -> int:
     writable(a.output)
     if a.own_recording and a.phase != CALIBRATION:
         raise InputError(f"--own-recording: the {a.phase} phase has no times of the recording that was fitted")
-    calibration = Calibration.from_dict(read_document(a.calibration), where=a.calibration)
+    calibration = tc.Calibration.from_dict(read_document(a.calibration), where=a.calibration)
     found = applied(
         calibration,
         a.recording,
@@ -45,7 +44,7 @@ def apply_command(a: argparse.Namespace) -> int:
         samples = _written(found, path, a.output.name)
     warn(found.cautions)
     how = f"{', '.join(calibration.terms)}, in {calibration.reference_unit}, {FRAME}"
-    say(f"{a.output}: {number_of(samples, 'sample')}, {how}")
+    say(f"{a.output}: {tc.number_format.number_of(samples, 'sample')}, {how}")
     return 0
 
 

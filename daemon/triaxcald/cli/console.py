@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from triaxcal.progress import Stage
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.abort import add_action, discard_action, steer
 from triaxcald.printable import printable, printable_json
 from triaxcald.text import waits
@@ -37,11 +36,11 @@ PLAIN_S = 10.0
 """Between two lines in a log."""
 ERASE = "\r\x1b[K"
 WORDS = {
-    Stage.POSES: "looking for still spans",
-    Stage.FIT: "fitting the linear model",
-    Stage.EFFECTS: "comparing possible effects",
-    Stage.ERRORS: "computing uncertainties",
-    Stage.ADVICE: "looking for the poses that tell most",
+    tc.Stage.POSES: "looking for still spans",
+    tc.Stage.FIT: "fitting the linear model",
+    tc.Stage.EFFECTS: "comparing possible effects",
+    tc.Stage.ERRORS: "computing uncertainties",
+    tc.Stage.ADVICE: "looking for the poses that tell most",
 }
 
 
@@ -118,7 +117,7 @@ def at(what: str, done: float | None = None) -> None:
         _line.at(what, done)
 
 
-def progress(stage: Stage, done: float | None = None) -> None:
+def progress(stage: tc.Stage, done: float | None = None) -> None:
     """The same of the metrology, as a `triaxcal.progress.Progress`."""
     at(WORDS[stage], done)
 
@@ -216,7 +215,7 @@ class _Output(Console):
 
 def micro(value: float | None) -> str:
     """A number of g in µg."""
-    return ErrorUnit().written(value)
+    return tc.units.ErrorUnit().written(value)
 
 
 class _Shown(Console):

@@ -7,9 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from triaxcal.effects import CATALOGUE
-from triaxcal.effects.plugins import package_of, plugins
-from triaxcal.rounding import REGISTER_DIGITS, number
+import triaxcal as tc
 from triaxcal_drivers.catalogue import BUILT_IN, listed, load_bundle
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcald import text
@@ -49,7 +47,10 @@ def registers_command(a: argparse.Namespace) -> int:
                 "format": "triaxcal.registers/1",
                 "unit": place.unit.name,
                 "serial": serial,
-                "registers": [{**dataclasses.asdict(r), "value": number(r.value, REGISTER_DIGITS)} for r in rows],
+                "registers": [
+                    {**dataclasses.asdict(r), "value": tc.rounding.number(r.value, tc.rounding.REGISTER_DIGITS)}
+                    for r in rows
+                ],
             }
         )
         return 0
@@ -100,7 +101,11 @@ def _profile(path: Path) -> dict[str, Any]:
 
 
 def _effects() -> list[dict[str, Any]]:
-    found, broken = plugins()
-    own = [{"name": e.name, "origin": "triaxcal", "fault": None} for e in CATALOGUE]
-    others = [{"name": e.name, "origin": package_of(e.name), "fault": None} for e in found]
-    return [*own, *others, *({"name": name, "origin": package_of(name), "fault": why} for name, why in broken)]
+    found, broken = tc.effects.plugins()
+    own = [{"name": e.name, "origin": "triaxcal", "fault": None} for e in tc.effects.CATALOGUE]
+    others = [{"name": e.name, "origin": tc.effects.package_of(e.name), "fault": None} for e in found]
+    return [
+        *own,
+        *others,
+        *({"name": name, "origin": tc.effects.package_of(name), "fault": why} for name, why in broken),
+    ]

@@ -12,28 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal import text
-from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.errors import Refused
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.recordings import gather, residuals_by_run, shape_by_poses, shape_of
-from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
-from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
-from triaxcal.interchange.calibration_document import Document, calibration_document
-from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.interchange.method_documents import attitudes_document, datasheet_document, turning_document
-from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
-from triaxcal.model.samples import Moment
-from triaxcal.number_format import number_of, plain, probability
-from triaxcal.pooled_units import Answer, PooledAnalysis, pooled_analysis
-from triaxcal.poses.pose import Pose
-from triaxcal.progress import Stage
-from triaxcal.text import diagnosis
-from triaxcal.text.pooled_units import other_unit, verdict
+import triaxcal as tc
 from triaxcald import documents
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import emit, micro, progress, show, table
@@ -64,7 +43,7 @@ DEFAULT_SIGNS = (
     "no --sign was given, so +,+,+ is taken: an output that falls where its axis points up needs a minus, "
     "and nothing in the data tells"
 )
-Way = tuple[Measured, Document, Calibration, Callable[[], None]]
+Way = tuple[Measured, tc.interchange.Document, tc.estimate.Calibration, Callable[[], None]]
 """What was measured, the document, the calibration, and how it is shown at the
 console."""
 
@@ -100,19 +79,21 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
     may have given."""
     try:
         yield
-    except Refused as e:
+    except tc.Refused as e:
         if e.wanted and not signs_given(a, measured):
-            raise Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
+            raise tc.Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
         raise
 
 
 def _turning(a: argparse.Namespace) -> Way:
-    moments = Moments()
+    moments = tc.inputs.Moments()
     measured = read_recording(a, a.recording, moments)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
-        found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
-    document = turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+        found = tc.inputs.fit_rotation(moments, signs=choice.signs, reference=choice.reference)
+    document = tc.interchange.turning_document(
+        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+    )
     calibration = found.calibration
     still = [p for p in measured.poses if not p.creep.any()]
     if len(still) >= POSES_ENOUGH:
@@ -121,16 +102,19 @@ def _turning(a: argparse.Namespace) -> Way:
     return measured, document, calibration, lambda: _show_turning(found, choice)
 
 
-def _show_turning(found: RotationFit, choice: Choice) -> None:
+def _show_turning(found: tc.inputs.RotationFit, choice: Choice) -> None:
     show_coefficients(found.calibration, choice)
     if t := found.temperature:
         show(held_at(t.mean, t.lowest, t.highest, "samples"))
     r, small = found.calibration.residual, choice.small
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
-    show(f"{number_of(found.samples, 'sample')}, whose noise is {noise} {choice.reference_unit} in x, y, z")
+    show(
+        f"{tc.number_format.number_of(found.samples, 'sample')}, whose noise is {noise} "
+        f"{choice.reference_unit} in x, y, z"
+    )
     show(
         f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
-        f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {tc.number_format.probability(r.lack_of_fit_p)}"
     )
 
 
@@ -140,7 +124,7 @@ def _attitudes(a: argparse.Namespace) -> Way:
     choice = chosen(a, measured)
     poses, rows = match(rows, measured.poses, path=a.attitudes, recording=measured.name)
     with telling_data_quality(measured):
-        found = fit_attitudes(
+        found = tc.inputs.fit_attitudes(
             poses,
             np.array([row.up for row in rows]),
             names=[row.name for row in rows],
@@ -148,11 +132,13 @@ def _attitudes(a: argparse.Namespace) -> Way:
             reference=choice.reference,
             attitude_error_rad=a.attitude_error,
         )
-    document = attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = tc.interchange.attitudes_document(
+        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+    )
     return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
 
 
-def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
+def _show_attitudes(found: tc.inputs.AttitudeFit, choice: Choice) -> None:
     c = found.calibration
     show_coefficients(c, choice)
     if said := temperature_of(c):
@@ -190,7 +176,7 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     r = c.residual
     show(
         f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, {cross_validated(r, small)}, noise floor "
-        f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {tc.number_format.probability(r.lack_of_fit_p)}"
     )
 
 
@@ -212,14 +198,16 @@ def _datasheet(a: argparse.Namespace) -> Way:
         reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
     )
     with telling_data_quality(measured), np.errstate(all="ignore"):  # numbers out of a file may be any
-        found = refine(measured.poses, datasheet)
-    document = datasheet_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+        found = tc.inputs.refine(measured.poses, datasheet)
+    document = tc.interchange.datasheet_document(
+        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+    )
     return measured, document, found.calibration, lambda: _show_datasheet(found, choice)
 
 
 def read_datasheet(
     document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
-) -> tuple[Datasheet, Mapping[str, str]]:
+) -> tuple[tc.inputs.Datasheet, Mapping[str, str]]:
     """The datasheet values in a calibration, loop or certificate document, and
     its units.
 
@@ -228,8 +216,8 @@ def read_datasheet(
     unit of the reference. ``reference`` is the magnitude in the poses, where it
     is not the document's. Raises InputError.
     """
-    sensor, channel_reference, own = sensor_of(document, where=where)
-    part = calibration_part(document, where=where)
+    sensor, channel_reference, own = tc.interchange.sensor_of(document, where=where)
+    part = tc.interchange.calibration_part(document, where=where)
     if reference is not None and not 0.9 < reference / own < 1.1:
         raise InputError(f"--reference {reference:g}: {where} was made for {own:g}, in another unit it seems")
     if errors is not None:
@@ -239,21 +227,21 @@ def read_datasheet(
     elif "standard_error" not in part:
         raise InputError(f"{where}: standard_error: missing; expected them, or --datasheet-error")
     else:
-        linear = linear_errors_of(part, where=where)
-        correlation = correlation_of(part, sensor, where=where)
-    standard_error = np.concatenate([linear, effect_errors_of(part, sensor, where=where)])
+        linear = tc.interchange.linear_errors_of(part, where=where)
+        correlation = tc.interchange.correlation_of(part, sensor, where=where)
+    standard_error = np.concatenate([linear, tc.interchange.effect_errors_of(part, sensor, where=where)])
     if not np.any(standard_error > 0):
         whose = f"{where}: standard_error" if errors is None else "--datasheet-error"
         raise InputError(f"{whose}: all are 0, so that nothing is left to refine")
     units = part.get("units")
     held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
     magnitude = own if reference is None else reference
-    return Datasheet(
-        sensor, standard_error, channel_reference, magnitude, correlation, holds_at_of(part, where=where)
+    return tc.inputs.Datasheet(
+        sensor, standard_error, channel_reference, magnitude, correlation, tc.interchange.holds_at_of(part, where=where)
     ), held
 
 
-def _show_datasheet(found: Refinement, choice: Choice) -> None:
+def _show_datasheet(found: tc.inputs.Refinement, choice: Choice) -> None:
     c = found.calibration
     table(
         f"datasheet values, refined by {len(c.poses)} poses",
@@ -276,7 +264,7 @@ def _show_datasheet(found: Refinement, choice: Choice) -> None:
     r, small = c.residual, choice.small
     show(
         f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; datasheet and poses "
-        f"agree with p {probability(found.conflict_p)}"
+        f"agree with p {tc.number_format.probability(found.conflict_p)}"
     )
 
 
@@ -305,7 +293,7 @@ def measured_each(a: argparse.Namespace) -> list[Measured]:
     empty = next((m for m in out if not m.poses), None)
     if empty is not None and len(out) > 1:
         warn(named_quality(empty))
-        raise Refused(f"{empty.name}: no still pose")
+        raise tc.Refused(f"{empty.name}: no still pose")
     return out
 
 
@@ -336,7 +324,7 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
     return replace(
         first,
         name=f"{first.name} and {len(recordings) - 1} more",
-        poses=gather([m.poses for m in recordings]),
+        poses=tc.estimate.gather([m.poses for m in recordings]),
         windows=None,
         unconfirmed=first.unconfirmed if all(m.unconfirmed for m in recordings) else "",
         data_quality=[line for m in recordings for line in named_quality(m)],
@@ -371,7 +359,7 @@ def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
     return out
 
 
-def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choice) -> list[str]:
+def doubts_of_one_unit(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
     """Lines where several recordings can hardly be of one unit; ``loop`` is
     that of all of them."""
     if len(recordings) == 1:
@@ -379,19 +367,23 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choic
     names = " and ".join(m.name for m in recordings)
     if said := unlike(names, loop.before.residual.rms_g, choice.reference, "do not look like one unit"):
         return said
-    shapes = [(m.name, shape_by_poses(m.poses, choice.signs, choice.reference)) for m in recordings]
+    shapes = [(m.name, tc.estimate.shape_by_poses(m.poses, choice.signs, choice.reference)) for m in recordings]
     known = [(name, shape) for name, shape in shapes if shape is not None]
-    return [line for name, shape in known[1:] for line in other_unit(known[0][0], name, known[0][1], shape)]
+    return [
+        line
+        for name, shape in known[1:]
+        for line in tc.text.pooled_units.other_unit(known[0][0], name, known[0][1], shape)
+    ]
 
 
-def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Choice) -> list[str]:
+def doubts_of_check(measured: Measured, check: Measured, loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
     """A line where the held-out poses can hardly be of the unit of those
     diagnosed in ``loop``."""
     assert loop.held_out is not None
     if said := unlike(check.name, loop.held_out.before_rms_g, choice.reference):
         return said
-    own = shape_by_poses(check.poses, choice.signs, choice.reference)
-    return other_unit(measured.name, check.name, shape_of(loop.before), own)
+    own = tc.estimate.shape_by_poses(check.poses, choice.signs, choice.reference)
+    return tc.text.pooled_units.other_unit(measured.name, check.name, tc.estimate.shape_of(loop.before), own)
 
 
 def _serial(m: Measured) -> str | None:
@@ -414,20 +406,23 @@ def _settings(choice: Choice) -> dict[str, str | None]:
     }
 
 
-def show_by_recording(loop: Loop, names: Sequence[str], choice: Choice) -> None:
+def show_by_recording(loop: tc.diagnosis.Loop, names: Sequence[str], choice: Choice) -> None:
     small = choice.small
     table(
         f"by recording, {small} rms",
         ["", "poses", "before", "after", "noise floor"],
         [
             [name, r.poses, *(small.written(v) for v in (r.before_rms_g, r.after_rms_g, r.noise_floor_g))]
-            for name, r in zip(names, residuals_by_run(loop.before, loop.after), strict=True)
+            for name, r in zip(names, tc.estimate.residuals_by_run(loop.before, loop.after), strict=True)
         ],
     )
 
 
 def show_agreement(
-    found: PooledAnalysis, names: Sequence[str], loops: Sequence[Loop], choices: Sequence[Choice]
+    found: tc.pooled_units.PooledAnalysis,
+    names: Sequence[str],
+    loops: Sequence[tc.diagnosis.Loop],
+    choices: Sequence[Choice],
 ) -> None:
     small = choices[0].small
     table(
@@ -452,8 +447,8 @@ def show_agreement(
         [
             [
                 c.effect,
-                diagnosis.chance(c.probability),
-                diagnosis.chance(c.common),
+                tc.text.diagnosis.chance(c.probability),
+                tc.text.diagnosis.chance(c.common),
                 " ".join(f"{p:.2f}" for p in c.units),
             ]
             for c in found.effects
@@ -462,13 +457,17 @@ def show_agreement(
     )
     for column, meaning in COLUMNS.items():
         show(f"{column}: {meaning}")
-    said = verdict(found)
-    show(said if found.answer is Answer.NOTHING else f"the units {said}")
+    said = tc.text.pooled_units.verdict(found)
+    show(said if found.answer is tc.pooled_units.Answer.NOTHING else f"the units {said}")
     for c in found.effects:
         if any(c.effect in group for group in found.agreed):
             for name, s in c.shapes.items():
-                known = "" if s.shared.standard_error is None else f" ± {plain(s.shared.standard_error, 2)}"
-                show(f"{c.effect}: {name} {plain(s.shared.value, 4)}{known} {s.shared.unit}")
+                known = (
+                    ""
+                    if s.shared.standard_error is None
+                    else f" ± {tc.number_format.plain(s.shared.standard_error, 2)}"
+                )
+                show(f"{c.effect}: {name} {tc.number_format.plain(s.shared.value, 4)}{known} {s.shared.unit}")
 
 
 def fit_command(a: argparse.Namespace) -> int:
@@ -480,9 +479,9 @@ def fit_command(a: argparse.Namespace) -> int:
     measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
-        progress(Stage.FIT)
-        calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
-    document = calibration_document(
+        progress(tc.Stage.FIT)
+        calibration = tc.estimate.fit(measured.poses, signs=choice.signs, reference=choice.reference)
+    document = tc.interchange.calibration_document(
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
     )
     document["data_quality"] = measured.data_quality
@@ -491,7 +490,7 @@ def fit_command(a: argparse.Namespace) -> int:
         emit(document)
     else:
         show_calibration(calibration, choice)
-        warn([*map(text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
+        warn([*map(tc.text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, calibration.residual.rms_g, calibration.reference)
 
 
@@ -525,10 +524,10 @@ def diagnose_command(a: argparse.Namespace) -> int:
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
         doubts += doubts_of_check(measured, check, loop, choice)
-    progress(Stage.ADVICE)
+    progress(tc.Stage.ADVICE)
     document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:
-        document = with_recordings(document, loop, names)
+        document = tc.interchange.with_recordings(document, loop, names)
     write_results(a, measured, document)
     if a.json:
         emit(document)
@@ -545,21 +544,28 @@ def diagnose_command(a: argparse.Namespace) -> int:
     return judge(a.limit, loop.after.residual.rms_g, loop.after.reference)
 
 
-def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[Pose] | None = None) -> Loop:
+def _loop(
+    a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[tc.Pose] | None = None
+) -> tc.diagnosis.Loop:
     with telling_data_quality(measured), telling_default_signs(a, measured):
-        return diagnose(
+        return tc.diagnosis.diagnose(
             measured.poses,
             signs=choice.signs,
             reference=choice.reference,
             check=check,
-            at=a.at if a.at is not None else measured.holds_at or Moment.END,
+            at=a.at if a.at is not None else measured.holds_at or tc.Moment.END,
             progress=progress,
         )
 
 
 def _loop_document(
-    loop: Loop, measured: Measured, choice: Choice, remarks: Sequence[str] = (), *, unit_in_doubt: bool = False
-) -> Document:
+    loop: tc.diagnosis.Loop,
+    measured: Measured,
+    choice: Choice,
+    remarks: Sequence[str] = (),
+    *,
+    unit_in_doubt: bool = False,
+) -> tc.interchange.Document:
     return documents.loop_document(
         loop,
         data_quality=measured.data_quality,
@@ -585,15 +591,15 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     for measured, choice in zip(recordings, choices, strict=True):
         try:
             loops.append(_loop(a, replace(measured, data_quality=named_quality(measured)), choice))
-        except Refused as e:
-            raise Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
-    found = pooled_analysis(loops)
+        except tc.Refused as e:
+            raise tc.Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
+    found = tc.pooled_units.pooled_analysis(loops)
     results = []
     for loop, measured, choice in zip(loops, recordings, choices, strict=True):
         results.append(
             _loop_document(loop, measured, choice) | ({"unit": dict(measured.unit)} if measured.unit else {})
         )
-    document = agreement_document(found, names, results, choices[0].reference_unit)
+    document = tc.interchange.agreement_document(found, names, results, choices[0].reference_unit)
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.json:
@@ -601,12 +607,17 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     else:
         show_agreement(found, names, loops, choices)
         for measured, loop in zip(recordings, loops, strict=True):
-            warnings = map(text.caution, loop.after.cautions)
+            warnings = map(tc.text.caution, loop.after.cautions)
             warn([*(f"{measured.name}: {line}" for line in warnings), *named_quality(measured)])
     return max(judge(a.limit, loop.after.residual.rms_g, loop.after.reference) for loop in loops)
 
 
-def write_results(a: argparse.Namespace, measured: Measured, document: Document, shown: Document | None = None) -> None:
+def write_results(
+    a: argparse.Namespace,
+    measured: Measured,
+    document: tc.interchange.Document,
+    shown: tc.interchange.Document | None = None,
+) -> None:
     """``document`` as a file, and a page of it, or of what is ``shown`` in its
     place."""
     if measured.unit:

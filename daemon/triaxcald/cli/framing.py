@@ -12,17 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.pose_fit import fit
-from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, opposite, recognise
-from triaxcal.frames.orientations import Assumed
-from triaxcal.frames.standing import Standing, stand
-from triaxcal.frames.unit_frames import Datum, Frames, frames
-from triaxcal.interchange.calibration_reading import but_is, sensor_of
-from triaxcal.model.directions import directions
-from triaxcal.number_format import probability
-from triaxcal.poses.stillness.detector import TURN_S, find_spans
-from triaxcal.units import reference_unit_of
+import triaxcal as tc
 from triaxcald import documents
 from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.showing import chosen, read_recording, telling_data_quality, warn
@@ -45,15 +35,15 @@ def frame_command(a: argparse.Namespace) -> int:
         raise InputError("-: standard input can be one recording, not several")
     calibrations = _for_each(a.calibration, names, "--calibration") or [OWN] * len(names)
     labels = _for_each(a.faces, names, "--faces", one_for_all=True) or _planned(a.plan, names)
-    assumed = Assumed(a.seating_error, a.table_tilt, a.turn_error)
+    assumed = tc.frames.Assumed(a.seating_error, a.table_tilt, a.turn_error)
     sources: list[Source] = []
-    standings: list[Standing] = []
+    standings: list[tc.frames.Standing] = []
     for name, calibration, given in zip(names, calibrations, labels, strict=True):
         with _of(name):
             source, standing = _placed(a, name, calibration, [s.name for s in sources], given, assumed)
             sources.append(source)
             standings.append(standing)
-    result = frames(standings, datum=Datum(a.datum) if a.datum else None)
+    result = tc.frames.frames(standings, datum=tc.frames.Datum(a.datum) if a.datum else None)
     document = frame_document(sources, result)
     if a.output:
         write_text(a.output, documents.to_text(document))
@@ -70,7 +60,7 @@ def frame_command(a: argparse.Namespace) -> int:
         say(f"outside the limit: standard error {worst:.3g} rad, limit {a.limit:.3g}")
         return OUTSIDE
     if result.agree is False:
-        say(f"not one fixture: the units disagree on its faces, p {probability(result.lack_of_fit_p)}")
+        say(f"not one fixture: the units disagree on its faces, p {tc.number_format.probability(result.lack_of_fit_p)}")
         return OUTSIDE
     return DONE
 
@@ -91,7 +81,7 @@ def _planned(path: str | None, names: Sequence[str]) -> list[Labels | None]:
         return [None] * len(names)
     document = read_document(path)
     if document.get("format") != "triaxcal.plan/1":
-        raise InputError(f"{path}: format: expected triaxcal.plan/1{but_is(document)}")
+        raise InputError(f"{path}: format: expected triaxcal.plan/1{tc.interchange.but_is(document)}")
     poses = document.get("poses")
     if not isinstance(poses, list) or not poses:
         raise InputError(f"{path}: poses: expected a list of poses")
@@ -109,9 +99,9 @@ def _of(name: str) -> Iterator[None]:
     """Says which recording it is that something is wrong with."""
     try:
         yield
-    except Refused as e:
-        raise Refused(f"{name}: {e}", wanted=e.wanted) from e
-    except InvalidData as e:
+    except tc.Refused as e:
+        raise tc.Refused(f"{name}: {e}", wanted=e.wanted) from e
+    except tc.InvalidData as e:
         raise InputError(f"{name}: {e}") from e
 
 
@@ -121,19 +111,19 @@ def _placed(
     calibration: str,
     taken: Sequence[str],
     given: Labels | None,
-    assumed: Assumed,
-) -> tuple[Source, Standing]:
+    assumed: tc.frames.Assumed,
+) -> tuple[Source, tc.frames.Standing]:
     """On a level table a turn and a knock look the same but for their length.
     Labels, where they count the poses, say how many of the longest were
     turns."""
-    measured = read_recording(a, name, turn_s=TURN_S)
+    measured = read_recording(a, name, turn_s=tc.poses.TURN_S)
     with telling_data_quality(measured):
         source = _source(a, measured, name, calibration, taken)
         try:
             return source, _stand(source, given, assumed)
-        except Miscounted:
+        except tc.frames.Miscounted:
             for turn_s in _lengths(measured):
-                with suppress(InvalidData, Refused):
+                with suppress(tc.InvalidData, tc.Refused):
                     assert measured.parted is not None
                     source = _source(a, measured.parted(turn_s), name, calibration, taken)
                     return source, _stand(source, given, assumed)
@@ -145,7 +135,7 @@ def _lengths(measured: Measured) -> list[float]:
     longest first."""
     if measured.windows is None:
         return []
-    found = {span.since_s for span in find_spans(measured.windows, turn_s=0.0)}
+    found = {span.since_s for span in tc.poses.find_spans(measured.windows, turn_s=0.0)}
     return sorted(found | {math.inf}, reverse=True)
 
 
@@ -156,12 +146,12 @@ def _source(a: argparse.Namespace, measured: Measured, name: str, calibration: s
     if called in taken:
         called = next(f"{called} ({n})" for n in range(2, len(taken) + 3) if f"{called} ({n})" not in taken)
     if calibration == OWN:
-        fitted = fit(measured.poses, signs=choice.signs, reference=choice.reference)
+        fitted = tc.estimate.fit(measured.poses, signs=choice.signs, reference=choice.reference)
         return own_source(
             called, measured, fitted, output_unit=choice.output_unit, reference_unit=choice.reference_unit
         )
     document = read_document(calibration)
-    sensor, _, reference = sensor_of(document, where=calibration)
+    sensor, _, reference = tc.interchange.sensor_of(document, where=calibration)
     signs = a.sign or measured.signs
     if signs and any(k * s < 0 for k, s in zip(sensor.scale_factor, signs, strict=True)):
         whose = "--sign" if a.sign else f"{name}: signs"
@@ -170,32 +160,32 @@ def _source(a: argparse.Namespace, measured: Measured, name: str, calibration: s
         raise InputError(f"--reference {a.reference:g}: {calibration} was made for {reference:g}")
     require_unit(document, measured, where=calibration)
     if not measured.poses:
-        raise Refused("no still pose", wanted=LABELS)
+        raise tc.Refused("no still pose", wanted=tc.frames.LABELS)
     return source_under(
         called,
         measured,
         document,
         where=calibration,
         output_unit=choice.output_unit,
-        reference_unit=a.reference_unit or reference_unit_of(reference),
+        reference_unit=a.reference_unit or tc.units.reference_unit_of(reference),
     )
 
 
-def _stand(source: Source, given: Labels | None, assumed: Assumed) -> Standing:
+def _stand(source: Source, given: Labels | None, assumed: tc.frames.Assumed) -> tc.frames.Standing:
     found = source.found
-    labelling: Labelling
+    labelling: tc.frames.Labelling
     if given is None:
-        labelling = recognise(found.direction, found.used)
+        labelling = tc.frames.recognise(found.direction, found.used)
     else:
-        known = {label for label, _ in directions()} | {NO_FACE}
+        known = {label for label, _ in tc.planning.directions()} | {NO_FACE}
         strange = [label for label, _ in given if label not in known and not label.startswith("N")]
         if strange:
-            raise InputError(f"label {strange[0]}: no such side; known: {', '.join(LABELS)}, * for no face")
-        labelling = labelled(found.direction, found.used, [x for x, _ in given], [h for _, h in given])
-    return stand(found, labelling, assumed)
+            raise InputError(f"label {strange[0]}: no such side; known: {', '.join(tc.frames.LABELS)}, * for no face")
+        labelling = tc.frames.labelled(found.direction, found.used, [x for x, _ in given], [h for _, h in given])
+    return tc.frames.stand(found, labelling, assumed)
 
 
-def _show(sources: Sequence[Source], result: Frames) -> None:
+def _show(sources: Sequence[Source], result: tc.frames.Frames) -> None:
     rotations, stood = [], []
     for source, unit in zip(sources, result.units, strict=True):
         errors = unit.standard_error
@@ -223,7 +213,7 @@ def _show(sources: Sequence[Source], result: Frames) -> None:
     table("tilt of the table, mrad", ["unit", "sides up", "tilt", "standard error", "from", "seating error"], stood)
     fixture = result.fixture
     faces = [
-        [opposite(label), *(f"{_mrad(-e)} ± {_mrad(s)}" for e, s in zip(error, errors, strict=True))]
+        [tc.frames.opposite(label), *(f"{_mrad(-e)} ± {_mrad(s)}" for e, s in zip(error, errors, strict=True))]
         for label, error, errors in zip(fixture.faces, fixture.error, fixture.standard_error, strict=True)
     ]
     table("errors of the faces' outward normals, mrad ± standard error", ["face", "x", "y", "z"], faces)

@@ -11,12 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from triaxcal import text as of_metrology
-from triaxcal.evidence.prior import Odds
-from triaxcal.number_format import number_of
-from triaxcal.rounding import concise, number
-from triaxcal.text import diagnosis as of_diagnosis
-from triaxcal.text.advice import of_creep
+import triaxcal as tc
 from triaxcal_drivers.hints import absent
 from triaxcald import text
 from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
@@ -119,17 +114,17 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     )
     for line in o.certified.document["result"]["summary"]:
         show(f"  {line}")
-    least = Odds().reported
+    least = tc.evidence.Odds().reported
     weights = {e.name: c.weights.get(e.name, 1.0) for e, _ in c.sensor.effects}
     likely = [effect for effect, _ in c.sensor.effects if weights[effect.name] >= least]
     rest = {e.name: weights[e.name] for e, _ in c.sensor.effects if e not in likely}
     if rest:
-        each = ", ".join(f"{name} ({of_diagnosis.chance(p)})" for name, p in rest.items())
+        each = ", ".join(f"{name} ({tc.text.diagnosis.chance(p)})" for name, p in rest.items())
         show(f"  corrected as far as it is probable: {each}")
     for effect in likely:
-        show(f"  corrected: {effect.name} (share {of_diagnosis.chance(weights[effect.name])})")
+        show(f"  corrected: {effect.name} (share {tc.text.diagnosis.chance(weights[effect.name])})")
         for name, (value, error, unit) in c.coefficients_of(effect.name).items():
-            show(f"    {name} {concise(value, error, unit)}")
+            show(f"    {name} {tc.rounding.concise(value, error, unit)}")
     if o.provisioned:
         show(f"  {text.provisioned(o.provisioned)}")
     if o.settling and o.error is None:
@@ -141,16 +136,19 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if not o.provisioned and o.certified.document["not_written"]:
         show(f"  no registers written: {o.certified.document['not_written']}")
     if o.lost:
-        show(f"  {number_of(o.lost, 'record')} {'was' if o.lost == 1 else 'were'} lost between bus and disk")
+        show(
+            f"  {tc.number_format.number_of(o.lost, 'record')} {'was' if o.lost == 1 else 'were'} lost between "
+            "bus and disk"
+        )
     show(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         show(f"  outside limits: {line}")
     for line in o.certified.document["result"]["data_quality"]:
         show(f"  warning: {line}")
-    if creep := of_creep([p.pose for p in c.poses]):
+    if creep := tc.text.advice.of_creep([p.pose for p in c.poses]):
         show(f"  creeping poses: {creep}")
     for caution in c.cautions:
-        show(f"  warning: {of_metrology.caution(caution)}")
+        show(f"  warning: {tc.text.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
     for what, path in papers.items():
         if path is not None:
@@ -185,7 +183,7 @@ def _demo_document(u: DemoUnit) -> dict[str, Any]:
         "hidden": {name: dict(values) for name, values in u.hidden.items()},
         "found": u.found,
         "kept": u.kept,
-        "after_power_cycle_rms_g": number(cycled.rms_g) if cycled else None,
+        "after_power_cycle_rms_g": tc.rounding.number(cycled.rms_g) if cycled else None,
     }
 
 

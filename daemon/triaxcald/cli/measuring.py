@@ -7,19 +7,7 @@ import math
 
 import numpy as np
 
-from triaxcal import text
-from triaxcal.documents import Calibration as Document
-from triaxcal.effects.contract import RUN, SINCE_START, TIME
-from triaxcal.errors import Refused
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.creep import with_unexplained_creep
-from triaxcal.estimate.hold_out import magnitude_errors
-from triaxcal.estimate.recordings import shape_in, shape_without_effects
-from triaxcal.interchange.calibration_document import poses_document
-from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
-from triaxcal.rounding import error
-from triaxcal.text.pooled_units import other_unit
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.cli.console import emit, show
 from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
@@ -29,7 +17,7 @@ from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 def poses(a: argparse.Namespace) -> int:
     measured = read_recording(a, a.recording)
-    document = poses_document(measured.poses)
+    document = tc.interchange.poses_document(measured.poses)
     for row, p in zip(document["poses"], measured.poses, strict=True):
         row |= trust(p)
     document["data_quality"] = measured.data_quality
@@ -58,7 +46,7 @@ def poses(a: argparse.Namespace) -> int:
 
 def verify_command(a: argparse.Namespace) -> int:
     document = read_document(a.calibration)
-    calibration = Document.from_dict(document, where=a.calibration)
+    calibration = tc.Calibration.from_dict(document, where=a.calibration)
     model = calibration.fitted
     sensor, reference = model.sensor, model.reference
     if a.sign and any(k * s < 0 for k, s in zip(sensor.scale_factor, a.sign, strict=True)):
@@ -76,35 +64,39 @@ def verify_command(a: argparse.Namespace) -> int:
     expected = float(np.sqrt(found.noise_floor_g**2 + np.mean(of_calibration**2)))
     warnings = unlike(measured.name, found.rms_g, reference)
     if not warnings:
-        held = shape_in(calibration_part(document, where=a.calibration))
-        warnings = other_unit(a.calibration, measured.name, held, shape_without_effects(model, measured.poses))
+        held = tc.estimate.shape_in(tc.interchange.calibration_part(document, where=a.calibration))
+        warnings = tc.text.pooled_units.other_unit(
+            a.calibration, measured.name, held, tc.estimate.shape_without_effects(model, measured.poses)
+        )
     warnings += _of_its_recording(model, a.calibration)
     result = {
         "format": "triaxcal.verify/1",
-        "rms_g": error(found.rms_g, reference),
-        "max_abs_g": error(found.max_abs_g, reference),
-        "noise_floor_g": error(found.noise_floor_g, reference),
-        "expected_rms_g": error(expected, reference) if np.isfinite(expected) else None,
+        "rms_g": tc.rounding.error(found.rms_g, reference),
+        "max_abs_g": tc.rounding.error(found.max_abs_g, reference),
+        "noise_floor_g": tc.rounding.error(found.noise_floor_g, reference),
+        "expected_rms_g": tc.rounding.error(expected, reference) if np.isfinite(expected) else None,
         "poses": pose_rows(found, reference),
         "data_quality": measured.data_quality,
         "warnings": warnings,
     }
-    unit = a.reference_unit or reference_unit_in(document, where=a.calibration, magnitude=reference)
+    unit = a.reference_unit or tc.interchange.reference_unit_in(document, where=a.calibration, magnitude=reference)
     if a.json:
         emit(result)
     else:
-        _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
+        _show_verified(
+            found, f"|a| − {reference:g} {unit} under {a.calibration}", tc.units.ErrorUnit.of(unit, reference)
+        )
         poses = counted(len(found.poses), len(found.untrusted))
-        show(text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
+        show(tc.text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
         warn([*warnings, *measured.data_quality])
     return judge(a.limit, found.rms_g, reference)
 
 
-def _of_its_recording(model: Calibration, name: str) -> list[str]:
+def _of_its_recording(model: tc.estimate.Calibration, name: str) -> list[str]:
     """A line each for effects of time, and of the recording, which say little
     of another recording."""
-    of_time = [e.name for e, _ in model.sensor.effects if {TIME, SINCE_START} & set(e.needs)]
-    of_run = [e.name for e, _ in model.sensor.effects if RUN in e.needs and e.name not in of_time]
+    of_time = [e.name for e, _ in model.sensor.effects if {tc.effects.TIME, tc.effects.SINCE_START} & set(e.needs)]
+    of_run = [e.name for e, _ in model.sensor.effects if tc.effects.RUN in e.needs and e.name not in of_time]
     out = []
     if of_time:
         held = model.holds_at
@@ -117,19 +109,19 @@ def _of_its_recording(model: Calibration, name: str) -> list[str]:
 
 def _require_trusted(measured: Measured) -> None:
     if not measured.poses:
-        raise Refused(f"{measured.name}: no still pose")
+        raise tc.Refused(f"{measured.name}: no still pose")
     if all(p.fault for p in measured.poses):
         faults = ", ".join(dict.fromkeys(p.fault for p in measured.poses))
-        raise Refused(f"{measured.name}: no still pose can be trusted: {len(measured.poses)} left out ({faults})")
+        raise tc.Refused(f"{measured.name}: no still pose can be trusted: {len(measured.poses)} left out ({faults})")
 
 
-def _verified(measured: Measured, model: Calibration, *, where: str) -> Verification:
+def _verified(measured: Measured, model: tc.estimate.Calibration, *, where: str) -> Verification:
     """Under a calibration of another recording. Raises InputError where what
     ``where`` holds gives no finite errors."""
     with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
-        errors, noise = magnitude_errors(
+        errors, noise = tc.estimate.magnitude_errors(
             model.sensor,
-            with_unexplained_creep(measured.poses, model, elsewhere=True),
+            tc.estimate.with_unexplained_creep(measured.poses, model, elsewhere=True),
             channel_reference=model.channel_reference,
             reference=model.reference,
             moment=model.moment,
@@ -141,7 +133,7 @@ def _verified(measured: Measured, model: Calibration, *, where: str) -> Verifica
     return found
 
 
-def _show_verified(found: Verification, title: str, small: ErrorUnit) -> None:
+def _show_verified(found: Verification, title: str, small: tc.units.ErrorUnit) -> None:
     show_poses(
         title,
         ["start s", f"error {small}", f"standard error {small}"],

@@ -8,35 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
-from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER, lag_in
-from triaxcal.errors import InvalidData
-from triaxcal.interchange.calibration_document import Document
-from triaxcal.model.directions import (
-    FULL,
-    LEAST,
-    PAPER,
-    Direction,
-    closed,
-    dilution,
-    directions,
-    linear_design,
-    worst_error,
-)
-from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
-from triaxcal.planning.design import (
-    Observability,
-    TargetEffects,
-    in_plan,
-    needs_time,
-    observability,
-    target_effects,
-    unseen_effects,
-)
-from triaxcal.planning.optimal_plan import OptimalPlan, optimal
-from triaxcal.rounding import number, numbers, uncertainty
-from triaxcal.text.advice import to_move
+import triaxcal as tc
 from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
@@ -49,15 +21,17 @@ def plan_command(a: argparse.Namespace) -> int:
         a.recording = a.effects.pop()  # --for takes all that follows, the recording too
     for name in a.effects:
         if not _known(name):
-            raise InputError(f"--for {name}: no effect of that name; known: {', '.join(e.name for e in CATALOGUE)}")
-    effects = [in_plan(effect_named(name)) for name in dict.fromkeys(a.effects)]
+            raise InputError(
+                f"--for {name}: no effect of that name; known: {', '.join(e.name for e in tc.effects.CATALOGUE)}"
+            )
+    effects = [tc.planning.in_plan(tc.effects.effect_named(name)) for name in dict.fromkeys(a.effects)]
     for effect in effects:
-        if set(effect.needs) & {*BEFORE, *CHANGE, *SCATTER}:
+        if set(effect.needs) & {*tc.effects.BEFORE, *tc.effects.CHANGE, *tc.effects.SCATTER}:
             raise InputError(
                 f"--for {effect.name}: expected an effect of direction, time or a channel; this one goes with the pose "
                 "before or with shaking, for which any plan does, taken twice in different orders"
             )
-        if any(lag_in(n) for n in effect.needs):
+        if any(tc.effects.lag_in(n) for n in effect.needs):
             raise InputError(
                 f"--for {effect.name}: expected an effect of direction, time or a channel; this one goes with what a "
                 "channel was before, for which any plan does, taken while that rises, falls and stands still"
@@ -70,13 +44,13 @@ def plan_command(a: argparse.Namespace) -> int:
         return _plan_for_recording(a, effects)
     try:
         return _plan_for(a, effects) if effects else _plain_plan(a)
-    except InvalidData as e:
+    except tc.InvalidData as e:
         raise InputError(f"--poses: {e}") from e
 
 
 def _known(name: str) -> bool:
     try:
-        effect_named(name)
+        tc.effects.effect_named(name)
     except KeyError:
         return False
     return True
@@ -90,8 +64,8 @@ def _looks_like_recording(word: str) -> bool:
 
 
 def _plain_plan(a: argparse.Namespace) -> int:
-    plan = closed(directions(a.poses or FULL))
-    document = _document(plan, _sights(plan, CATALOGUE))
+    plan = tc.planning.closed(tc.planning.directions(a.poses or tc.planning.FULL))
+    document = _document(plan, _sights(plan, tc.effects.CATALOGUE))
     if a.json:
         emit(document)
     else:
@@ -99,18 +73,18 @@ def _plain_plan(a: argparse.Namespace) -> int:
     return 0
 
 
-def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
-    found = optimal(a.poses or _enough_for(effects), effects)
+def _plan_for(a: argparse.Namespace, effects: Sequence[tc.effects.Effect]) -> int:
+    found = tc.planning.optimal(a.poses or _enough_for(effects), effects)
     plan = list(found.plan)
-    others = [e for e in CATALOGUE if e.name not in [targets.name for targets in effects]]
+    others = [e for e in tc.effects.CATALOGUE if e.name not in [targets.name for targets in effects]]
     document = _document(plan, _sights(plan, [*effects, *others], found.levels))
     for i, pose in enumerate(document["poses"]):
         if found.levels:
-            pose["levels"] = {name: number(float(v[i])) for name, v in found.levels.items()}
+            pose["levels"] = {name: tc.rounding.number(float(v[i])) for name, v in found.levels.items()}
     document |= {
         "for": [e.name for e in effects],
         "together": _together(found.targets),
-        "efficiency": uncertainty(found.efficiency),
+        "efficiency": tc.rounding.uncertainty(found.efficiency),
         "promised": _errors(found.errors),
         "moves": _moves(found),
     }
@@ -129,63 +103,71 @@ def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
     return 0
 
 
-def _enough_for(effects: Sequence[Effect]) -> int:
+def _enough_for(effects: Sequence[tc.effects.Effect]) -> int:
     """The smaller of the plain plans that shows the effects; more where they
     have more coefficients than it poses."""
     names = {e.name for e in effects}
-    plain = (n for n in (PAPER, FULL) if not names & set(unseen_effects(_ups(closed(directions(n))), effects)))
-    return max(next(plain, FULL), LEAST + target_effects(effects).rank)
+    plain = (
+        n
+        for n in (tc.planning.PAPER, tc.planning.FULL)
+        if not names & set(tc.planning.unseen_effects(_ups(tc.planning.closed(tc.planning.directions(n))), effects))
+    )
+    return max(next(plain, tc.planning.FULL), tc.planning.LEAST + tc.planning.target_effects(effects).rank)
 
 
-def _ups(plan: Sequence[Direction]) -> Floats:
+def _ups(plan: Sequence[tc.planning.Direction]) -> tc.Floats:
     return np.array([v for _, v in plan])
 
 
 def _sights(
-    plan: Sequence[Direction], effects: Sequence[Effect], held: Mapping[str, Floats] | None = None
-) -> dict[str, Observability]:
-    return {e.name: observability(_ups(plan), e, held) for e in effects}
+    plan: Sequence[tc.planning.Direction],
+    effects: Sequence[tc.effects.Effect],
+    held: Mapping[str, tc.Floats] | None = None,
+) -> dict[str, tc.planning.Observability]:
+    return {e.name: tc.planning.observability(_ups(plan), e, held) for e in effects}
 
 
-def _document(plan: Sequence[Direction], observabilities: Mapping[str, Observability]) -> Document:
-    poses: list[Document] = [{"label": label, "up": numbers(v)} for label, v in plan]
+def _document(
+    plan: Sequence[tc.planning.Direction], observabilities: Mapping[str, tc.planning.Observability]
+) -> tc.interchange.Document:
+    poses: list[tc.interchange.Document] = [{"label": label, "up": tc.rounding.numbers(v)} for label, v in plan]
     poses[-1]["repeat"] = True
     return {
         "format": "triaxcal.plan/1",
         "poses": poses,
         "directions": len(plan) - 1,
-        "dilution": number(dilution(ups := _ups(plan))),
-        "worst_standard_error": number(worst_error(linear_design(ups, ups))),
+        "dilution": tc.rounding.number(tc.planning.dilution(ups := _ups(plan))),
+        "worst_standard_error": tc.rounding.number(tc.planning.worst_error(tc.planning.linear_design(ups, ups))),
         **_seen(observabilities),
     }
 
 
-def _seen(observabilities: Mapping[str, Observability]) -> Document:
+def _seen(observabilities: Mapping[str, tc.planning.Observability]) -> tc.interchange.Document:
     return {
         "blind_to": [name for name, s in observabilities.items() if s.visible < s.of],
         "sees": {
             name: {
                 "visible": s.visible,
                 "of": s.of,
-                "hidden": [{"coefficients": {k: uncertainty(w) for k, w in h.items()}} for h in s.hidden],
+                "hidden": [{"coefficients": {k: tc.rounding.uncertainty(w) for k, w in h.items()}} for h in s.hidden],
             }
             for name, s in observabilities.items()
         },
     }
 
 
-def _together(targets: TargetEffects) -> Document:
+def _together(targets: tc.planning.TargetEffects) -> tc.interchange.Document:
     return {"visible": targets.rank, "of": len(targets.seen)}
 
 
-def _errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None = 1.0) -> Document:
+def _errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None = 1.0) -> tc.interchange.Document:
     return {
-        name: {c: None if e is None or scale is None else uncertainty(e * scale) for c, e in of.items()}
+        name: {c: None if e is None or scale is None else tc.rounding.uncertainty(e * scale) for c, e in of.items()}
         for name, of in errors.items()
     }
 
 
-def _moves(found: OptimalPlan) -> dict[str, str]:
+def _moves(found: tc.planning.OptimalPlan) -> dict[str, str]:
     out = {}
     for name, levels in found.levels.items():
         steps, at = [], 1
@@ -194,8 +176,8 @@ def _moves(found: OptimalPlan) -> dict[str, str]:
             steps.append(f"{_level(level)} for poses {at} to {at + size - 1}" if size > 1 else f"{_level(level)} {at}")
             at += size
         out[name] = f"over as wide a range as can be had: {', '.join(steps)}"
-    if needs_time(found.targets.effects):
-        out[TIME] = "the poses at even intervals and in this order, the first again at the end"
+    if tc.planning.needs_time(found.targets.effects):
+        out[tc.effects.TIME] = "the poses at even intervals and in this order, the first again at the end"
     return out
 
 
@@ -204,7 +186,7 @@ def _level(level: float) -> str:
     return named.get(round(level, 6), f"{(1 + level) / 2:.0%} of the range")
 
 
-def _never_seen(document: Document) -> list[str]:
+def _never_seen(document: tc.interchange.Document) -> list[str]:
     out = []
     for name in document["for"]:
         s = document["sees"][name]
@@ -221,22 +203,24 @@ def _never_seen(document: Document) -> list[str]:
 # With one
 
 
-def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
+def _plan_for_recording(a: argparse.Namespace, effects: Sequence[tc.effects.Effect]) -> int:
     measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     existing = [p for p in measured.poses if not p.fault]
     with telling_data_quality(measured):
-        found = missing_poses(existing, effects, signs=choice.signs, reference=choice.reference)
+        found = tc.planning.missing_poses(existing, effects, signs=choice.signs, reference=choice.reference)
     observabilities = (
-        None if found.existing is None else {e.name: observability(found.existing.up, e) for e in CATALOGUE}
+        None
+        if found.existing is None
+        else {e.name: tc.planning.observability(found.existing.up, e) for e in tc.effects.CATALOGUE}
     )
-    document: Document = {
+    document: tc.interchange.Document = {
         "format": "triaxcal.plan/1",
         "have": len(existing),
         "left_out": len(measured.poses) - len(existing),
-        "dilution": number(found.dilution),
-        "worst_standard_error": None if found.existing is None else number(found.existing.worst_error),
-        "noise_g": uncertainty(found.noise),
+        "dilution": tc.rounding.number(found.dilution),
+        "worst_standard_error": None if found.existing is None else tc.rounding.number(found.existing.worst_error),
+        "noise_g": tc.rounding.uncertainty(found.noise),
         **(_seen(observabilities) if observabilities else {"blind_to": None, "sees": None}),
         "poses": [_added(found, pose) for pose in found.wanted],
     }
@@ -245,7 +229,7 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
             "for": [e.name for e in effects],
             "promised": _errors(_of_all(effects, found.now), found.noise),
             "cannot_show": _not_shown(found, effects),
-            "moves": {name: to_move(channel) for name, channel in found.moves.items()},
+            "moves": {name: tc.text.advice.to_move(channel) for name, channel in found.moves.items()},
         }
     document["data_quality"] = measured.data_quality
     if a.json:
@@ -265,37 +249,37 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
     for why in document.get("cannot_show", {}).values():
         show(why)
     for name, channel in found.moves.items():
-        show(f"{name}: {to_move(channel)}")
+        show(f"{name}: {tc.text.advice.to_move(channel)}")
     if observabilities is not None:
         show(f"the {len(existing)} there are cannot show: {_list(document['blind_to'])}")
     warn(measured.data_quality)
     return 0
 
 
-def _added(found: MissingPoses, pose: Addition) -> Document:
+def _added(found: tc.planning.MissingPoses, pose: tc.planning.Addition) -> tc.interchange.Document:
     noise = found.noise
-    out: Document = {
+    out: tc.interchange.Document = {
         "label": pose.label,
-        "up": numbers(pose.up),
-        "dilution": number(pose.dilution),
-        "worst_standard_error": number(pose.worst_error),
-        "standard_error_g": None if noise is None else uncertainty(pose.worst_error * noise),
+        "up": tc.rounding.numbers(pose.up),
+        "dilution": tc.rounding.number(pose.dilution),
+        "worst_standard_error": tc.rounding.number(pose.worst_error),
+        "standard_error_g": None if noise is None else tc.rounding.uncertainty(pose.worst_error * noise),
     }
     if pose.errors:
         out["promised"] = _errors(pose.errors, noise)
     if pose.levels:
-        out["levels"] = {name: number(v) for name, v in pose.levels.items()}
+        out["levels"] = {name: tc.rounding.number(v) for name, v in pose.levels.items()}
     return out
 
 
 def _of_all(
-    effects: Sequence[Effect], errors: Mapping[str, Mapping[str, float | None]]
+    effects: Sequence[tc.effects.Effect], errors: Mapping[str, Mapping[str, float | None]]
 ) -> dict[str, Mapping[str, float | None]]:
     """With the effects for which the recording has no channel."""
     return {e.name: errors.get(e.name) or dict.fromkeys(c.name for c in e.coefficients) for e in effects}
 
 
-def _not_shown(found: MissingPoses, effects: Sequence[Effect]) -> dict[str, str]:
+def _not_shown(found: tc.planning.MissingPoses, effects: Sequence[tc.effects.Effect]) -> dict[str, str]:
     """In words, by effect: what of it the poses there cannot show, and whether
     the poses to add do."""
     out = {}
@@ -317,7 +301,7 @@ def _not_shown(found: MissingPoses, effects: Sequence[Effect]) -> dict[str, str]
     return out
 
 
-def _show_wanted(title: str, found: MissingPoses) -> None:
+def _show_wanted(title: str, found: tc.planning.MissingPoses) -> None:
     channels = list(found.wanted[0].levels)
     rows = [
         [
@@ -338,7 +322,7 @@ def _show_errors(errors: Mapping[str, Mapping[str, float | None]], scale: float 
         show(f"standard errors of {name} ({note}): {values}")
 
 
-def _show(plan: Sequence[Direction], document: Document) -> None:
+def _show(plan: Sequence[tc.planning.Direction], document: tc.interchange.Document) -> None:
     title = f"{document['directions']} directions, the first repeated at the end"
     rows = [[i + 1, label, *(f"{c:+.3f}" for c in v)] for i, (label, v) in enumerate(plan)]
     table(title, ["pose", "up", "x", "y", "z"], rows)

@@ -7,14 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from triaxcal.arrays import Floats
-from triaxcal.effects.contract import is_derived
-from triaxcal.errors import Refused
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.projected_calibration import Reduced
-from triaxcal.interchange.calibration_reading import calibration_of, expanded_uncertainty_in, logged_in
-from triaxcal.number_format import micro_g
-from triaxcal.rounding import REGISTER_DIGITS, number
+import triaxcal as tc
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.certificate import held_by_device, image_of, why_not_written
@@ -87,8 +80,8 @@ def _words(p: Provisioning) -> list[dict[str, Any]]:
             "before": raw.hex(),
             "wanted": words[name].raw.hex() if name in words else None,
             "after": p.after.raw[name].hex(),
-            "value": number(words[name].value, REGISTER_DIGITS) if name in words else None,
-            "held": number(words[name].held, REGISTER_DIGITS) if name in words else None,
+            "value": tc.rounding.number(words[name].value, tc.rounding.REGISTER_DIGITS) if name in words else None,
+            "held": tc.rounding.number(words[name].held, tc.rounding.REGISTER_DIGITS) if name in words else None,
         }
         for name, raw in p.found.raw.items()
     ]
@@ -120,48 +113,50 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
     the reference vector, other signs, effects that the device cannot hold.
     """
     document = read_document(path)
-    full = calibration_of(document, where=path)
+    full = tc.interchange.calibration_of(document, where=path)
     profile = place.bundle.profile
     if not 0.9 <= full.reference <= 1.1:
-        raise Refused(f"{path}: the reference is {full.reference:g}; registers are in units of g")
+        raise tc.Refused(f"{path}: the reference is {full.reference:g}; registers are in units of g")
     serial = _serial_of(document, path, place)
     if missing := why_not_written(profile):
-        raise Refused(f"{path}: {profile.name}: {missing}")
-    logged = logged_in(document, where=path)
+        raise tc.Refused(f"{path}: {profile.name}: {missing}")
+    logged = tc.interchange.logged_in(document, where=path)
     held = held_by_device(profile, full, logged)
     assert held is not None
     registers = held.registers.calibration
     _require_little_lost(document, full, held.registers, path, profile, logged)
     for axis, k, sign in zip("xyz", registers.sensor.scale_factor, place.signs, strict=True):
         if k * sign < 0:
-            raise Refused(f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign")
+            raise tc.Refused(
+                f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign"
+            )
     return image_of(profile, registers, days_since_1970()), serial
 
 
 def _require_little_lost(
     document: Mapping[str, Any],
-    full: Calibration,
-    registers: Reduced,
+    full: tc.estimate.Calibration,
+    registers: tc.estimate.Reduced,
     path: str,
     profile: Profile,
-    logged: Mapping[str, Floats],
+    logged: Mapping[str, tc.Floats],
 ) -> None:
     """Raises Refused where the registers would be off by more than the
     calibration itself may be, or where nobody knows by how much: ``logged`` are
     the channels that are known as they were in the poses."""
     lost = [effect.name for effect, _ in full.sensor.effects if effect.name not in registers.calibration.terms]
-    known = expanded_uncertainty_in(document, where=path)
+    known = tc.interchange.expanded_uncertainty_in(document, where=path)
     passing = {effect.name for effect, _ in full.sensor.effects if is_passing(effect)}
     if not set(lost) <= passing and not registers.cost <= (known or 0.0):
-        stated = "" if known is None else f", and its expanded uncertainty is {micro_g(known)}"
-        raise Refused(
+        stated = "" if known is None else f", and its expanded uncertainty is {tc.number_format.micro_g(known)}"
+        raise tc.Refused(
             f"{path}: {profile.name} has no registers for {', '.join(lost)}; the best that it can hold is off by "
-            f"{micro_g(registers.cost)} rms{stated}"
+            f"{tc.number_format.micro_g(registers.cost)} rms{stated}"
         )
     for effect, _ in full.sensor.effects:
-        unknown = [name for name in effect.needs if name not in logged and not is_derived(name)]
+        unknown = [name for name in effect.needs if name not in logged and not tc.effects.is_derived(name)]
         if effect.name in lost and unknown:
-            raise Refused(
+            raise tc.Refused(
                 f"{path}: {profile.name} has no registers for {effect.name}, and the poses do not say how "
                 f"{', '.join(unknown)} moved: what that costs is not known"
             )
@@ -170,7 +165,7 @@ def _require_little_lost(
     if others := [name for name in lost if name not in passing]:
         say(
             f"{profile.name} has no registers for {', '.join(others)}: the other coefficients take their place, "
-            f"{micro_g(registers.cost)} rms off"
+            f"{tc.number_format.micro_g(registers.cost)} rms off"
         )
 
 
@@ -181,7 +176,7 @@ def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | No
     if not isinstance(meant, str | None):
         raise InputError(f"{path}: unit.serial: expected text, not {meant!r}")
     if meant is not None and expected is not None and not same_serial(meant, expected):
-        raise Refused(f"{path}: is for the unit with serial {meant}, the station expects {expected}")
+        raise tc.Refused(f"{path}: is for the unit with serial {meant}, the station expects {expected}")
     return meant or expected
 
 
@@ -193,7 +188,7 @@ def restore_command(a: argparse.Namespace) -> int:
     snapshot, _ = snapshot_in(a.source, place.bundle.profile)
     expected = place.unit.serial
     if snapshot.serial is not None and expected is not None and not same_serial(snapshot.serial, expected):
-        raise Refused(f"{a.source}: is of the unit with serial {snapshot.serial}, the station expects {expected}")
+        raise tc.Refused(f"{a.source}: is of the unit with serial {snapshot.serial}, the station expects {expected}")
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
     run = RestoreRun(station, place, ask=ask, snapshot=snapshot, source=a.source)
     done = run_interruptible(run.run())

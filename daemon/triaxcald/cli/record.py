@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcald import text
 from triaxcald.cli.console import Bars, say
 from triaxcald.cli.devices import of_a_journal, warn_of_a_journal
@@ -340,14 +340,14 @@ def _summary(kept: Kept) -> str:
         parts = [text.bus_recorded(kept.unit, kept.counts, kept.seconds), str(kept.path)]
     else:
         parts = [
-            f"{kept.path}: {number_of(kept.counts['samples'], 'sample')} in "
+            f"{kept.path}: {tc.number_format.number_of(kept.counts['samples'], 'sample')} in "
             f"{text.own_seconds(kept.seconds, kept.host_seconds)}"
         ]
         parts += beside_samples({kind: n for kind, n in kept.counts.items() if kind != "receiver_overflows"})
     if kept.gaps:
-        parts.append(f"{number_of(kept.gaps, 'gap')} of {kept.gaps_s:.1f} s in all")
+        parts.append(f"{tc.number_format.number_of(kept.gaps, 'gap')} of {kept.gaps_s:.1f} s in all")
     if kept.unconfirmed:
-        parts.append(f"{number_of(kept.unconfirmed, 'record')} unconfirmed")
+        parts.append(f"{tc.number_format.number_of(kept.unconfirmed, 'record')} unconfirmed")
     if kept.lost:
-        parts.append(f"{number_of(kept.lost, 'record')} lost between bus and disk")
+        parts.append(f"{tc.number_format.number_of(kept.lost, 'record')} lost between bus and disk")
     return ", ".join(parts)

@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.logs.kinds import Kind, opened
@@ -141,7 +141,7 @@ def export_command(a: argparse.Namespace) -> int:
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e
         lost = beside_samples(stream.counts) + losses_of(recording)
-    say(f"{number_of(rows, 'sample')}; {', '.join(lost) or 'none lost'}")
+    say(f"{tc.number_format.number_of(rows, 'sample')}; {', '.join(lost) or 'none lost'}")
     return 0
 
 

@@ -5,11 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from triaxcal import text
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.inputs.bias_update import updated_biases
-from triaxcal.text import bias_update
-from triaxcal.uncertainty import budget
+import triaxcal as tc
 from triaxcald.cli.console import emit, show
 from triaxcald.cli.fitting import title_of, write_results
 from triaxcald.cli.results import show_budget, show_coefficients
@@ -41,7 +37,7 @@ def rezero_command(a: argparse.Namespace) -> int:
         reference_unit=earlier.reference_unit,
     )
     with telling_data_quality(measured):
-        found = updated_biases(measured.poses, file.known(title_of(measured.name)), first=a.poses)
+        found = tc.inputs.updated_biases(measured.poses, file.known(title_of(measured.name)), first=a.poses)
     loop = rezero_document(
         found,
         data_quality=measured.data_quality,
@@ -57,16 +53,16 @@ def rezero_command(a: argparse.Namespace) -> int:
         emit(document)
     else:
         _show(found, choice)
-        warn([*map(text.caution, found.cautions), *measured.data_quality])
+        warn([*map(tc.text.caution, found.cautions), *measured.data_quality])
     if a.poses is not None and len(found.poses) < a.poses:
         warn([f"--poses {a.poses}: {measured.name} has {len(found.poses)} distinct poses"])
     return judge(a.limit, found.residual.rms_g, found.reference)
 
 
-def _show(found: Calibration, choice: Choice) -> None:
-    b = budget(found, choice.stated)
+def _show(found: tc.estimate.Calibration, choice: Choice) -> None:
+    b = tc.uncertainty.budget(found, choice.stated)
     show_coefficients(found, choice, b.parameters)
     assert found.update is not None
-    for line in bias_update.lines(found, found.update, choice.small):
+    for line in tc.text.bias_update.lines(found, found.update, choice.small):
         show(line)
     show_budget(b, choice)

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 
-from triaxcal.errors import Refused, TriaxcalError
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcal_drivers.hints import lacking
 from triaxcald.cli.console import Unshown, say
@@ -34,7 +34,7 @@ def _run(check: Callable[[], None], work: Callable[[], int]) -> int:
         code = work()
         sys.stdout.flush()
         return code
-    except Refused as e:
+    except tc.Refused as e:
         say(f"triaxcal: refused: {e}" + (f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""))
         return REFUSED
     except RegisterValueError as e:
@@ -45,7 +45,7 @@ def _run(check: Callable[[], None], work: Callable[[], int]) -> int:
             raise
         say(f"triaxcal: {what}")
         return BAD_INPUT
-    except (TriaxcalError, DriverError, DaemonError) as e:
+    except (tc.TriaxcalError, DriverError, DaemonError) as e:
         say(f"triaxcal: {e}")
         return exit_code_of(e)
     except Interrupted as e:

@@ -8,15 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-from triaxcal.documents import Calibration
-from triaxcal.effects.contract import channel_of
-from triaxcal.errors import Refused
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.model.gravity import local_gravity_g
-from triaxcal.poses.pose import Pose
-from triaxcal.rounding import error
-from triaxcal.uncertainty import Stated
-from triaxcal.units import ErrorUnit, reference_unit_of
+import triaxcal as tc
 from triaxcald.cli.console import at, say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, require_same_outputs
@@ -33,20 +25,20 @@ class Choice:
     reference: float
     output_unit: str
     reference_unit: str
-    stated: Stated
+    stated: tc.Stated
 
     @property
-    def small(self) -> ErrorUnit:
-        return ErrorUnit.of(self.reference_unit, self.reference)
+    def small(self) -> tc.units.ErrorUnit:
+        return tc.units.ErrorUnit.of(self.reference_unit, self.reference)
 
 
 def read_recording(
     a: argparse.Namespace,
     name: str,
-    moments: Moments | None = None,
-    of: Calibration | None = None,
+    moments: tc.inputs.Moments | None = None,
+    of: tc.Calibration | None = None,
     turn_s: float | None = None,
-    wanted_by: Calibration | None = None,
+    wanted_by: tc.Calibration | None = None,
 ) -> Measured:
     """The still poses of the recording ``name``, read as the arguments say; how
     a table was read is told. ``of`` is the calibration that is to be applied to
@@ -67,13 +59,15 @@ def read_recording(
     return found
 
 
-def reading_of(a: argparse.Namespace, name: str, of: Calibration | None = None) -> Reading:
+def reading_of(a: argparse.Namespace, name: str, of: tc.Calibration | None = None) -> Reading:
     """How a table is to be read, where ``of`` is the calibration that needs its
     channels. Raises InputError where the recording is none."""
     said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
     if is_recording(name) and said != Reading():
         raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
-    return said if of is None else replace(said, wanted=frozenset(map(channel_of, of.fitted.channel_reference)))
+    return (
+        said if of is None else replace(said, wanted=frozenset(map(tc.effects.channel_of, of.fitted.channel_reference)))
+    )
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
@@ -86,25 +80,25 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
         raise InputError("--reference: --latitude and --height say it already; give one or the other")
     if latitude is not None and a.reference_unit not in (None, "g"):
         raise InputError(f"--reference-unit {a.reference_unit}: --latitude and --height give the reference in g")
-    local = None if latitude is None or height is None else local_gravity_g(latitude, height)[0]
+    local = None if latitude is None or height is None else tc.local_gravity_g(latitude, height)[0]
     reference = a.reference or local or measured.reference or 1.0
     return Choice(
         a.sign or measured.signs or (1, 1, 1),
         reference,
         a.output_unit or (measured.profile.output.unit if measured.profile else measured.output_unit),
-        a.reference_unit or reference_unit_of(reference),
+        a.reference_unit or tc.units.reference_unit_of(reference),
         _stated(a, measured),
     )
 
 
-def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
+def _stated(a: argparse.Namespace, measured: Measured) -> tc.Stated:
     """What the recording's station says holds where the user says nothing, but
     for another reference."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
-    own = measured.stated or Stated()
+    own = measured.stated or tc.Stated()
     thermometer = getattr(a, "thermometer_uncertainty", None)
     sensitivity = getattr(a, "thermal_sensitivity", None)
-    said = Stated.at(
+    said = tc.Stated.at(
         latitude,
         height,
         getattr(a, "reference_uncertainty", None),
@@ -122,7 +116,7 @@ def counted(poses: int, left_out: int, what: str = "poses") -> str:
     return f"{poses} {what}" + (f", {left_out} of them left out" if left_out else "")
 
 
-def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], poses: Sequence[Pose]) -> None:
+def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], poses: Sequence[tc.Pose]) -> None:
     """A table with a row for each pose, and, where some are at fault, with a
     column that says which and why."""
     if any(p.fault for p in poses):
@@ -133,7 +127,7 @@ def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]
 
 def judge(limit: float | None, rms: float, reference: float) -> int:
     """On the figure as it is printed."""
-    printed = error(rms, reference)
+    printed = tc.rounding.error(rms, reference)
     if limit is not None and not (printed is not None and printed <= limit):
         say(f"outside the limit: rms {rms:.3g}, limit {limit:.3g}")
         return 1
@@ -151,8 +145,8 @@ def telling_data_quality(measured: Measured) -> Iterator[None]:
     of which most is not used."""
     try:
         yield
-    except Refused as e:
+    except tc.Refused as e:
         warn(measured.data_quality)
         if measured.unconfirmed and e.wanted:
-            raise Refused(str(e)) from e
+            raise tc.Refused(str(e)) from e
         raise

@@ -11,17 +11,14 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-from triaxcal.model.gravity import HEIGHTS_M
+import triaxcal as tc
 from triaxcal_drivers.hints import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
-
-if TYPE_CHECKING:
-    from triaxcal.model.samples import Moment
 
 # Arguments that several commands share, and a parser whose errors are one line.
 
@@ -74,12 +71,11 @@ def signs(text: str) -> tuple[int, int, int]:
     return known[parts[0]], known[parts[1]], known[parts[2]]
 
 
-def moment(text: str) -> Moment | float:
+def moment(text: str) -> tc.Moment | float:
     """`end`, `mean`, or seconds from the first sample."""
-    from triaxcal.model.samples import Moment  # numpy, which help does without
 
-    if text in (Moment.END, Moment.MEAN):
-        return Moment(text)
+    if text in (tc.Moment.END, tc.Moment.MEAN):
+        return tc.Moment(text)
     try:
         return not_negative(text)
     except argparse.ArgumentTypeError:
@@ -131,7 +127,7 @@ def latitude(text: str) -> float:
 
 
 def height(text: str) -> float:
-    return within(text, *HEIGHTS_M, f"metres between {HEIGHTS_M[0]:g} and {HEIGHTS_M[1]:g}")
+    return within(text, *tc.HEIGHTS_M, f"metres between {tc.HEIGHTS_M[0]:g} and {tc.HEIGHTS_M[1]:g}")
 
 
 def within(text: str, low: float, high: float, wanted: str) -> float:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.mcap.container import Channel
 from triaxcald.errors import InputError
@@ -61,5 +61,5 @@ def listed(counted: Iterable[tuple[Channel, int]]) -> str:
     shown = []
     for channel, count in counts[:SHOWN]:
         own = [f"{clipped(key)} {clipped(value)}" for key, value in channel.metadata if (key, value) not in common]
-        shown.append(f"{channel.number} ({', '.join([*own[:1], number_of(count, 'message')])})")
+        shown.append(f"{channel.number} ({', '.join([*own[:1], tc.number_format.number_of(count, 'message')])})")
     return ", ".join(shown) + (", …" if len(counts) > SHOWN else "")

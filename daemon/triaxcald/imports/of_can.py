@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.can.model import CanProfile
@@ -166,7 +166,7 @@ def _identifiers_shown(keys: Iterable[Key]) -> str:
 
 
 def _listed(counted: Mapping[Any, int]) -> str:
-    shown = [f"{clipped(what)} ({number_of(count, 'frame')})" for what, count in counted.items()]
+    shown = [f"{clipped(what)} ({tc.number_format.number_of(count, 'frame')})" for what, count in counted.items()]
     return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
 
 
@@ -247,7 +247,8 @@ class _Work:
             if not counts["samples"]:
                 why = ", ".join(text.no_samples(counts)) or "no sample is whole"
                 raise InputError(
-                    f"{log.name}: no sample in its {number_of(chosen.taken, 'frame')} of the profile: {why}"
+                    f"{log.name}: no sample in its {tc.number_format.number_of(chosen.taken, 'frame')} of the "
+                    f"profile: {why}"
                 )
         except InputError as e:
             others = "".join(f"; {count} of kind '{kind}'" for kind, count in account.others.items())

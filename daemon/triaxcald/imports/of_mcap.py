@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.hints import clipped, nearest
 from triaxcal_drivers.logs.frames import LONGEST_NS, Account
@@ -165,7 +165,8 @@ class _Work:
         if not counts["samples"]:
             why = ", ".join(text.no_samples(counts)) or "none is of the readings"
             raise InputError(
-                f"{self._log.name}: no sample in its {number_of(self._taken, 'message')} of the profile: {why}"
+                f"{self._log.name}: no sample in its {tc.number_format.number_of(self._taken, 'message')} of "
+                f"the profile: {why}"
             )
         return {
             "kind": MCAP_KIND,

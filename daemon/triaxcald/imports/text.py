@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 
 _REMARKS = {
     "no_times": "the log tells no times: samples are laid at the profile's rate, from zero",
@@ -33,7 +33,7 @@ _COUNTS = {
 def summary(output: object, detail: Mapping[str, Any], seconds: float) -> str:
     """One line."""
     counts = detail["samples"]
-    came = f"{number_of(counts['samples'], 'sample')} in {seconds:.2f} s"
+    came = f"{tc.number_format.number_of(counts['samples'], 'sample')} in {seconds:.2f} s"
     return ", ".join([f"{output}: {came} from {detail['file']} ({detail['kind']})", *no_samples(counts)])
 
 
@@ -46,7 +46,7 @@ def left_out(detail: Mapping[str, Any]) -> str:
     """What of the log is not in the recording; empty where all is."""
     whole, elsewhere = detail["other_frames"], detail["elsewhere"]
     one, of = ("message", "topics") if detail["kind"] == "MCAP" else ("frame", "identifiers")
-    parts = [f"{number_of(whole, one)} of other {of}"] if whole else []
+    parts = [f"{tc.number_format.number_of(whole, one)} of other {of}"] if whole else []
     parts += [f"{elsewhere} of other channels or nodes"] if elsewhere else []
     parts += [f"{count} of kind '{kind}'" for kind, count in detail["other_records"].items()]
     return f"left out: {', '.join(parts)}" if parts else ""
@@ -70,19 +70,25 @@ def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
     times = detail["times"]
     if times["back"]:
         lines.append(
-            f"{number_of(times['back'], 'record')} came with a time before that of an earlier one, by up to"
+            f"{tc.number_format.number_of(times['back'], 'record')} came with a time before that of an earlier "
+            "one, by up to"
             f" {times['furthest_back_s']:.6g} s; these times are kept"
         )
     if times["equal"]:
         lines.append(
-            f"{number_of(times['equal'], 'sample')} came with the time of the one before; the commands that read the"
+            f"{tc.number_format.number_of(times['equal'], 'sample')} came with the time of the one before; the "
+            "commands that read the"
             " recording leave such out"
         )
     if off := _off(detail, seconds):
         lines.append(off)
     if times["pauses"]:
-        lines.append(f"{number_of(times['pauses'], 'pause')}, the longest of {times['longest_pause_s']:.6g} s")
+        lines.append(
+            f"{tc.number_format.number_of(times['pauses'], 'pause')}, the longest of {times['longest_pause_s']:.6g} s"
+        )
     if detail["damaged"]:
-        more = f", and {number_of(detail['damaged'] - 1, 'more place')}" if detail["damaged"] > 1 else ""
+        more = (
+            f", and {tc.number_format.number_of(detail['damaged'] - 1, 'more place')}" if detail["damaged"] > 1 else ""
+        )
         lines.append(f"damaged: {detail['damage']}{more}; what is whole was taken")
     return lines

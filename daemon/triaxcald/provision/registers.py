@@ -10,10 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.effects import effect_of
-from triaxcal.errors import Refused
-from triaxcal.model.sensor import Sensor
+import triaxcal as tc
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import ProfileError, RegisterValueError
 from triaxcal_drivers.interface import Device
@@ -269,7 +266,7 @@ LEAST = 3
 """So few samples or poses say nothing."""
 
 
-def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | None:
+def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] | None:
     """The sensor that the registers describe, and its reference temperature in
     °C; None where they describe none."""
     held = {r.role: profile.decode(n, snapshot.raw[n]) for n, r in profile.registers.items() if n in snapshot.raw}
@@ -284,12 +281,12 @@ def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | No
         name, coefficient = parsed(role)
         if coefficient and name not in LINEAR:
             effects.setdefault(name, {})[coefficient] = value
-    found = [effect_of(name, values) for name, values in effects.items() if any(values.values())]
-    return Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(REFERENCE_ROLE, 0.0)
+    found = [tc.effects.effect_of(name, values) for name, values in effects.items() if any(values.values())]
+    return tc.Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(REFERENCE_ROLE, 0.0)
 
 
 def departure_g(
-    profile: Profile, snapshot: Snapshot, readings: Floats, corrected: Floats, channels: Mapping[str, Floats]
+    profile: Profile, snapshot: Snapshot, readings: tc.Floats, corrected: tc.Floats, channels: Mapping[str, tc.Floats]
 ) -> float | None:
     """Median distance in g of the ``corrected`` output (n,3) from what the
     registers make of the ``readings`` (n,3) of the same moments; ``channels``
@@ -302,7 +299,7 @@ def departure_g(
         return None
     try:
         expected = sensor.specific_force(readings, covariates)
-    except Refused:
+    except tc.Refused:
         return None
     return float(np.median(np.linalg.norm(corrected - expected, axis=1)))
 
@@ -319,7 +316,7 @@ NAMED = 3
 """So many registers tell enough."""
 
 
-class ReadingsNotStated(Refused):
+class ReadingsNotStated(tc.Refused):
     """The readings may be corrected already, and the profile does not say.
     Raised before anything is written."""
 

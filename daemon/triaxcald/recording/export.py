@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from triaxcal.arrays import Ints
+import triaxcal as tc
 from triaxcal_drivers.interface import SampleBlock
 from triaxcald.errors import RecordingError
 
@@ -21,7 +21,7 @@ class Rows:
     name, (n,) each: arrays of floats, or cells as they stood in the table that
     was read."""
 
-    time_ns: Ints
+    time_ns: tc.Ints
     columns: Mapping[str, Any]
 
     @classmethod

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Message, MetadataIndex, Statistics
 from mcap.records import Metadata as MetadataRecord
 
-from triaxcal.number_format import number_of
+import triaxcal as tc
 from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
 from triaxcald.files import unused
@@ -86,7 +86,7 @@ def open_manifest(path: Path) -> Opened:
 
 
 def _by(rebuilt: Manifest) -> str:
-    return f"the manifest was rebuilt from {number_of(len(rebuilt.segments), 'segment')}"
+    return f"the manifest was rebuilt from {tc.number_format.number_of(len(rebuilt.segments), 'segment')}"
 
 
 def settled(manifest: Manifest) -> Manifest:

@@ -15,7 +15,7 @@ from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
-from triaxcal.errors import Refused
+import triaxcal as tc
 from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
 from triaxcald.files import exists_already, new_file
@@ -248,7 +248,7 @@ def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
     with new_file(out) as sink:
         recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
         if not (recovery.messages or recovery.attachments):
-            raise Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
+            raise tc.Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
         return recovery
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.report.document import Outcome
 from triaxcald.report.figures import micro_g, p_value, ratio
 from triaxcald.report.stages import Residual
@@ -22,7 +22,7 @@ class Row:
     first: bool = False
 
 
-def before_after(outcome: Outcome, unit: ErrorUnit) -> tuple[Row, ...]:
+def before_after(outcome: Outcome, unit: tc.units.ErrorUnit) -> tuple[Row, ...]:
     """None where the document holds no residual."""
     if not outcome.stages:
         return ()

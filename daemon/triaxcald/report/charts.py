@@ -16,14 +16,9 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from triaxcal.effects.contract import SINCE_START
-from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace
-from triaxcal.pictures import Inks, paint_trace
-from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
-from triaxcal.text import traces as words
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.report.document import CANDIDATE, Finding, Outcome, Pose
-from triaxcald.report.figures import MICRO_G, chance, clean, effect_title, micro, micro_g, number, unit_label
+from triaxcald.report.figures import MICRO_G, chance, clean, micro, micro_g, number, unit_label
 from triaxcald.report.ink import AFTER, AXES, BAND, FLOOR, GRID, INK, MUTED, draw, hang_grid
 from triaxcald.report.meanings import run_of
 from triaxcald.report.over_time import stage_colours
@@ -35,7 +30,9 @@ Group = tuple[str, list[tuple[str, float]], float | None]
 _LONGEST_LABEL = 34
 
 
-def bars_picture(stages: Sequence[Stage], held_out: HoldOut | None, unit: ErrorUnit = MICRO_G) -> Markup | None:
+def bars_picture(
+    stages: Sequence[Stage], held_out: HoldOut | None, unit: tc.units.ErrorUnit = MICRO_G
+) -> Markup | None:
     """Errors of every stage against the noise floor, or None when none is
     known."""
     groups = _bar_groups(stages, held_out)
@@ -109,7 +106,7 @@ def _bar_groups(stages: Sequence[Stage], held_out: HoldOut | None) -> list[Group
 
 def _bar_group(
     axes: Axes, top: float, bars: list[tuple[str, float]], floor_g: float | None,
-    colours: dict[str, str], axis_end: float, unit: ErrorUnit, *, named: bool,
+    colours: dict[str, str], axis_end: float, unit: tc.units.ErrorUnit, *, named: bool,
 ) -> None:  # fmt: skip
     for i, (label, value_g) in enumerate(bars):
         axes.barh(top + i, unit.count(value_g), 0.78, color=colours[label])
@@ -134,7 +131,7 @@ def moments_in(outcome: Outcome, recording: str) -> Mapping[str, float]:
     """By name, in s by the clock of the recording; an empty name is the only
     one's."""
     return {
-        clean(effect_title(finding.effect)): at_s
+        clean(tc.text.traces.effect_title(finding.effect)): at_s
         for finding in outcome.findings
         if (at_s := finding.shape("at")) is not None and finding.in_model and _recording(finding, outcome) == recording
     }
@@ -203,7 +200,7 @@ _LABEL_SIZE = (0.25, 0.14)
 
 
 def sphere_pictures(
-    poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: ErrorUnit = MICRO_G
+    poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: tc.units.ErrorUnit = MICRO_G
 ) -> tuple[Markup, ...]:
     """Poses on two equal-area hemispheres coloured by residual, a picture a
     stage on one scale; none without directions or residuals."""
@@ -214,7 +211,7 @@ def sphere_pictures(
     return tuple(_of_stage(poses, stage, norm, unit, f"sphere{i or ''}") for i, stage in enumerate(shown))
 
 
-def _of_stage(poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm, unit: ErrorUnit, name: str) -> Markup:
+def _of_stage(poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm, unit: tc.units.ErrorUnit, name: str) -> Markup:
     def paint(figure: Figure) -> None:
         pair = figure.subplots(1, 2, squeeze=False)
         for axes, side in zip(pair[0], (1, -1), strict=True):
@@ -298,7 +295,9 @@ def _labels(numbers: Sequence[int], places: NDArray[np.float64]) -> list[tuple[N
     return [(place, ", ".join(map(str, group))) for place, group in groups]
 
 
-def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float, unit: ErrorUnit) -> None:
+def _colour_bar(
+    figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float, unit: tc.units.ErrorUnit
+) -> None:
     bar = figure.colorbar(
         ScalarMappable(norm, _COLOURS), ax=grid, orientation="horizontal", fraction=share, pad=0.02, aspect=37,
         spacing="uniform",
@@ -314,7 +313,7 @@ def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, s
 
 PANEL_IN = (4.2, 2.9)
 """Of a size that letters are legible on a telephone and in three columns."""
-INKS = Inks(used=FLOOR, excluded=MUTED, curve=AFTER, band=BAND, zero=MUTED)
+INKS = tc.pictures.Inks(used=FLOOR, excluded=MUTED, curve=AFTER, band=BAND, zero=MUTED)
 MOST = 12
 """Panels of one document: three for each of four effects."""
 
@@ -330,21 +329,21 @@ class Panel:
     """Whether it is of partial residuals."""
 
 
-def trace_panels(value: object, outcome: Outcome, unit: ErrorUnit = MICRO_G) -> tuple[Panel, ...]:
+def trace_panels(value: object, outcome: Outcome, unit: tc.units.ErrorUnit = MICRO_G) -> tuple[Panel, ...]:
     """Of the ``traces`` of a document; of one that has none the residuals in
     standard errors, as far as these are known."""
     known = list(read_traces(value))[:MOST] or list(_residuals(outcome.poses))
     return tuple(_panel(trace, outcome, unit, f"trace{i}") for i, trace in enumerate(known))
 
 
-def read_traces(value: object) -> Iterator[Trace]:
+def read_traces(value: object) -> Iterator[tc.evidence.Trace]:
     """Those that can be drawn."""
     for entry in value if isinstance(value, (list, tuple)) else []:
         known = mapping(entry)
         x, y, error = (_array(known.get(key)) for key in ("x", "y", "error"))
         curve = mapping(known.get("curve"))
         grid, fitted, half = (_array(curve.get(key)) for key in ("x", "y", "half_width"))
-        if known.get("quantity") not in list(Quantity) or not len(x) or not len(x) == len(y) == len(error):
+        if known.get("quantity") not in list(tc.evidence.Quantity) or not len(x) or not len(x) == len(y) == len(error):
             continue
         whole = len(grid) == len(fitted) == len(half) and bool(np.isfinite([grid, fitted, half]).all())
         nothing = np.empty(0)
@@ -352,12 +351,12 @@ def read_traces(value: object) -> Iterator[Trace]:
         excluded = np.resize([bool(v) for v in flags] if isinstance(flags, list) and flags else [False], len(x))
         sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(error)
         if sound.any():
-            yield Trace(
+            yield tc.evidence.Trace(
                 effect=clean(known.get("effect") or ""),
                 axis=clean(known.get("axis") or "")[:1],
                 coefficients=tuple(map(clean, texts(known.get("coefficients")))),
-                variable=clean(known.get("variable") or POSE),
-                quantity=Quantity(str(known["quantity"])),
+                variable=clean(known.get("variable") or tc.evidence.POSE),
+                quantity=tc.evidence.Quantity(str(known["quantity"])),
                 pose=np.flatnonzero(sound),
                 x=x[sound],
                 y=y[sound],
@@ -376,18 +375,18 @@ def _array(value: object) -> NDArray[np.float64]:
     return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
 
 
-def _residuals(poses: Sequence[Pose]) -> Iterator[Trace]:
+def _residuals(poses: Sequence[Pose]) -> Iterator[tc.evidence.Trace]:
     known = [(p, p.residual_g / p.standard_error_g) for p in poses if p.residual_g is not None and p.standard_error_g]
     if not known:
         return
     timed = all(p.middle_s is not None for p, _ in known) and len({p.recording for p, _ in known}) == 1
     nothing = np.empty(0)
-    yield Trace(
+    yield tc.evidence.Trace(
         effect="",
         axis="",
         coefficients=(),
-        variable=SINCE_START if timed else POSE,
-        quantity=Quantity.STANDARD_ERRORS,
+        variable=tc.effects.SINCE_START if timed else tc.evidence.POSE,
+        quantity=tc.evidence.Quantity.STANDARD_ERRORS,
         pose=np.array([p.number - 1 for p, _ in known]),
         x=np.array([p.middle_s if timed else p.number for p, _ in known], dtype=np.float64),
         y=np.array([ratio for _, ratio in known]),
@@ -399,24 +398,24 @@ def _residuals(poses: Sequence[Pose]) -> Iterator[Trace]:
     )
 
 
-def _panel(trace: Trace, outcome: Outcome, unit: ErrorUnit, name: str) -> Panel:
+def _panel(trace: tc.evidence.Trace, outcome: Outcome, unit: tc.units.ErrorUnit, name: str) -> Panel:
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
-        paint_trace(axes, trace, unit, INKS)
+        tc.pictures.paint_trace(axes, trace, unit, INKS)
         hang_grid(axes)
 
-    drawing = draw(name, words.description(trace, unit), PANEL_IN, paint)
-    partial = trace.quantity is not Quantity.STANDARD_ERRORS
-    return Panel(words.title(trace), _caption(trace, outcome), drawing, partial)
+    drawing = draw(name, tc.text.traces.description(trace, unit), PANEL_IN, paint)
+    partial = trace.quantity is not tc.evidence.Quantity.STANDARD_ERRORS
+    return Panel(tc.text.traces.title(trace), _caption(trace, outcome), drawing, partial)
 
 
-def _caption(trace: Trace, outcome: Outcome) -> str:
+def _caption(trace: tc.evidence.Trace, outcome: Outcome) -> str:
     """How sure it is that this acts, or what the picture says."""
-    if trace.quantity is Quantity.STANDARD_ERRORS:
+    if trace.quantity is tc.evidence.Quantity.STANDARD_ERRORS:
         return _of_residuals(outcome)
     if trace.share is not None:
         return _of_curve(trace.share, trace.p_value)
-    if trace.effect == words.SMOOTH:
+    if trace.effect == tc.text.traces.SMOOTH:
         return "The mean over all that may act, as a function of the direction"
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
     if finding is None:
@@ -428,7 +427,7 @@ def _of_curve(share: float, p_value: float | None) -> str:
     said = f"Smooth curves on three axes take away {100 * max(share, 0.0):.0f} % (adjusted)"
     if p_value is None:
         return said
-    if p_value > SIGNIFICANT:
+    if p_value > tc.poses.SIGNIFICANT:
         return f"{said}, no more than chance does for one of these variables (p {p_value:.2g})"
     return f"{said}; chance does as much with p {p_value:.1g}"
 
@@ -436,7 +435,9 @@ def _of_curve(share: float, p_value: float | None) -> str:
 def _of_finding(finding: Finding) -> str:
     sure = "Probable" if finding.probability is None else f"Probability {chance(finding.probability)}"
     if finding.alternatives:
-        return f"{sure}; or instead {', '.join(effect_title(n).lower() for n in finding.alternatives[:3])}"
+        return (
+            f"{sure}; or instead {', '.join(tc.text.traces.effect_title(n).lower() for n in finding.alternatives[:3])}"
+        )
     return sure + (", not certain" if finding.verdict == CANDIDATE else "")
 
 

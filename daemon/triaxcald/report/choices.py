@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from triaxcal.effects.runs import BETWEEN_RUNS
+import triaxcal as tc
 from triaxcald.doubts import HOST, PROCESS, REGISTERS
 from triaxcald.report.document import Finding, Outcome
-from triaxcald.report.figures import effect_title
 from triaxcald.report.registers import Device, passes
 from triaxcald.report.stages import Residual, residual_of
 from triaxcald.report.untrusted import mapping, texts
@@ -43,7 +42,7 @@ def who_corrects(finding: Finding, device: Device | None) -> str:
     """In use, after the calibration."""
     if not finding.in_model:
         return "nobody: it is not in the model"
-    if finding.effect in {effect.name for effect in BETWEEN_RUNS}:
+    if finding.effect in {effect.name for effect in tc.effects.BETWEEN_RUNS}:
         return "nobody in advance: it comes anew with every start"
     if passes(finding.effect):
         return "nobody: it depends on how these poses were taken; keep it out of the process"
@@ -89,5 +88,5 @@ def _who(by: Sequence[str], terms: Sequence[str], registers: Sequence[str], pass
 
 
 def _named(terms: Sequence[str]) -> str:
-    names = ["linear model" if name == "linear" else effect_title(name).lower() for name in terms]
+    names = ["linear model" if name == "linear" else tc.text.traces.effect_title(name).lower() for name in terms]
     return ", ".join(names) + (" alone" if names == ["linear model"] else "")

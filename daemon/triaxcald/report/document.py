@@ -13,12 +13,8 @@ from pathlib import PurePath
 
 import numpy as np
 
-from triaxcal.estimate.calibration import Exclusion
-from triaxcal.evidence.prior import Odds
-from triaxcal.interchange.calibration_document import WEIGHT
-from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
-from triaxcal.units import ErrorUnit
-from triaxcald.report.figures import clean, effect_title, number
+import triaxcal as tc
+from triaxcald.report.figures import clean, number
 from triaxcald.report.stages import HoldOut, Residual, Stage, held_out_of, stages_of
 from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
 
@@ -63,7 +59,7 @@ EVEN = 0.5
 CANDIDATE = "candidate"
 """The verdict on an effect that probably acts; documents have it under
 ``candidates``."""
-_NOT_AGAIN = (Exclusion.UNKNOWN_HISTORY, Exclusion.CALLER)
+_NOT_AGAIN = (tc.estimate.Exclusion.UNKNOWN_HISTORY, tc.estimate.Exclusion.CALLER)
 """Poses that are not to be taken again, though the fit excludes them."""
 
 
@@ -127,7 +123,7 @@ class Finding:
     def hangs_on_a_pose(self) -> bool:
         """Whether it is likely enough to be known, and is not since some one
         pose may be an outlier."""
-        likely = self.probability is not None and Odds().hangs_on_one_pose(self.probability)
+        likely = self.probability is not None and tc.evidence.Odds().hangs_on_one_pose(self.probability)
         return self.verdict == CANDIDATE and (likely or self.hangs_on_one_pose) and not self.alternatives
 
     def shape(self, name: str) -> float | None:
@@ -188,9 +184,9 @@ class Outcome:
         return self.stages[-1].residual if self.stages else Residual()
 
     @property
-    def small(self) -> ErrorUnit:
+    def small(self) -> tc.units.ErrorUnit:
         """The unit in which errors are told."""
-        return ErrorUnit.of(self.reference_unit, 1.0 if self.reference is None else self.reference)
+        return tc.units.ErrorUnit.of(self.reference_unit, 1.0 if self.reference is None else self.reference)
 
     @property
     def mean_decimals(self) -> int:
@@ -219,7 +215,7 @@ class Outcome:
         unexplained = self.unexplained is not None and self.unexplained.significant
         outliers = any(pose.again for pose in self.poses)
         something = nothing is not None and nothing < EVEN and not outliers
-        return unexplained or something or (p is not None and p < LACK_OF_FIT)
+        return unexplained or something or (p is not None and p < tc.poses.LACK_OF_FIT)
 
 
 def read_document(document: Mapping[str, object]) -> Outcome:
@@ -279,7 +275,7 @@ def _averaged(document: Mapping[str, object], effects: Mapping[str, object]) -> 
     are neither findings nor candidates: each with its probability."""
     listed = (entry for key in ("findings", "candidates") for entry in _entries(document.get(key)))
     named = {name for entry in listed for name in (str(entry.get("effect")), *texts(entry.get("alternatives")))}
-    weights = {name: mapping(values).get(WEIGHT) for name, values in effects.items()}
+    weights = {name: mapping(values).get(tc.interchange.WEIGHT) for name, values in effects.items()}
     return {name: number(weight) for name, weight in weights.items() if name not in named and weight is not None}
 
 
@@ -351,7 +347,7 @@ def _coefficients(value: object) -> tuple[Coefficient, ...]:
         unit = str(known.get("unit") or "")
         return Coefficient(str(name), number(known.get("value")), number(known.get("standard_error")), unit)
 
-    return tuple(one(name, entry) for name, entry in mapping(value).items() if name != WEIGHT)
+    return tuple(one(name, entry) for name, entry in mapping(value).items() if name != tc.interchange.WEIGHT)
 
 
 def _linear(calibration: Mapping[str, object], units: object) -> Iterator[Coefficient]:
@@ -361,7 +357,7 @@ def _linear(calibration: Mapping[str, object], units: object) -> Iterator[Coeffi
         values, value_errors = vector(calibration.get(name)), vector(errors.get(name))
         for i, axis in enumerate("xyz"):
             yield Coefficient(
-                f"{effect_title(name)} {axis} ({symbol}{axis})",
+                f"{tc.text.traces.effect_title(name)} {axis} ({symbol}{axis})",
                 None if values is None else values[i],
                 None if value_errors is None else value_errors[i],
                 str(known_units.get(name) or usual[name]),

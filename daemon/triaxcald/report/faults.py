@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.report.document import Pose
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import QUALITY
@@ -36,7 +36,7 @@ def faults_of(lines: Iterable[str]) -> tuple[Fault, ...]:
     return tuple(sorted(found, key=lambda fault: not fault.spoils))
 
 
-def left_out(poses: Sequence[Pose], unit: ErrorUnit) -> tuple[str, ...]:
+def left_out(poses: Sequence[Pose], unit: tc.units.ErrorUnit) -> tuple[str, ...]:
     """The poses that the fit did not use and that are to be taken again, with
     where they are and by how much they are off."""
     return tuple(

@@ -11,10 +11,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from triaxcal.effects import OWN, meaning_of
-from triaxcal.effects.channel import BIAS, SCALE_FACTOR
-from triaxcal.effects.contract import IN_ONE_RUN, RUN, Meaning, covariate_of
-from triaxcald.report.figures import clean, digits, effect_title, power
+import triaxcal as tc
+from triaxcald.report.figures import clean, digits, power
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,18 @@ QUALITY = {
     "unknown_noise": "Noise of the pose means not known",
 }
 _NAME = re.compile(
-    rf"\b(?:(?:{BIAS}|{SCALE_FACTOR})[^\s,;]+?(?=[:,;.]?(?:\s|$))|"
+    rf"\b(?:(?:{tc.effects.BIAS}|{tc.effects.SCALE_FACTOR})[^\s,;]+?(?=[:,;.]?(?:\s|$))|"
     + "|".join(
-        sorted((*(e.name for e in OWN), BIAS.rstrip(":"), SCALE_FACTOR.rstrip(":"), *QUALITY), key=len, reverse=True)
+        sorted(
+            (
+                *(e.name for e in tc.effects.OWN),
+                tc.effects.BIAS.rstrip(":"),
+                tc.effects.SCALE_FACTOR.rstrip(":"),
+                *QUALITY,
+            ),
+            key=len,
+            reverse=True,
+        )
     )
     + r")(?!\w)"
 )
@@ -60,13 +67,13 @@ def told(effect: str, references: Mapping[str, float | None]) -> Told:
     """``references`` are the values from which the conditions count, by
     channel."""
     meaning, channel = _meaning(effect)
-    title = effect_title(effect)
+    title = tc.text.traces.effect_title(effect)
     if meaning is None:
         return Told(title, title.lower(), "", "", "")
     letter, name = meaning.reference or ("", "")
-    value = references.get(name.replace("{c}", covariate_of(channel)))
+    value = references.get(name.replace("{c}", tc.effects.covariate_of(channel)))
     where = [meaning.symbols] if meaning.symbols else []
-    if letter == "t₀" and RUN in references:
+    if letter == "t₀" and tc.effects.RUN in references:
         where.append("t₀: the middle of each recording's poses")
     elif letter and value is not None:
         where.append(f"{letter} = {value:.6g}".replace("-", "−"))
@@ -84,7 +91,7 @@ def factor(effect: str, coefficient: str) -> tuple[str, str]:
     axis, by = _factor(meaning.factors if meaning else {}, coefficient)
     if meaning is None or run is None or not by:
         return axis, by
-    return axis, (IN_ONE_RUN if alone else meaning.in_run).format(by=by, n=run)
+    return axis, (tc.effects.IN_ONE_RUN if alone else meaning.in_run).format(by=by, n=run)
 
 
 def run_of(coefficient: str) -> tuple[str, int | None, bool]:
@@ -123,9 +130,9 @@ def _written_out(number: str, mantissa: str) -> str:
 def _plain(name: str) -> str:
     if name in QUALITY:
         return name.replace("_", " ")
-    head, _, channel = effect_title(name).partition(":")
+    head, _, channel = tc.text.traces.effect_title(name).partition(":")
     return head.lower() + (f":{channel}" if channel else "")
 
 
-def _meaning(effect: str) -> tuple[Meaning | None, str]:
-    return meaning_of(effect), clean(effect.partition(":")[2])
+def _meaning(effect: str) -> tuple[tc.effects.Meaning | None, str]:
+    return tc.effects.meaning_of(effect), clean(effect.partition(":")[2])

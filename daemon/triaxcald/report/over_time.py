@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.report.document import Pose
 from triaxcald.report.figures import MICRO_G, clean, unit_label
 from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
@@ -34,7 +34,7 @@ def time_pictures(
     noise_floor_g: float | None,
     *,
     moments_in: Callable[[str], Mapping[str, float]],
-    unit: ErrorUnit,
+    unit: tc.units.ErrorUnit,
 ) -> list[tuple[str, tuple[Markup, ...]]]:
     """Those of each recording, by its own clock, with the recording's name;
     ``moments_in`` it are marked."""
@@ -66,7 +66,7 @@ def time_panels(
     noise_floor_g: float | None,
     *,
     moments: Mapping[str, float] | None = None,
-    unit: ErrorUnit = MICRO_G,
+    unit: tc.units.ErrorUnit = MICRO_G,
     name: str = "time",
 ) -> tuple[Markup, ...]:
     """A panel a stage, each on its own scale, and one for each logged channel
@@ -151,7 +151,7 @@ def _moving_channels(poses: Sequence[Pose]) -> dict[str, NDArray[np.float64]]:
     return dict(list(moving.items())[:_MOST_CHANNELS])
 
 
-def _noise_band(axes: Axes, noise_floor_g: float | None, unit: ErrorUnit) -> None:
+def _noise_band(axes: Axes, noise_floor_g: float | None, unit: tc.units.ErrorUnit) -> None:
     axes.axhline(0, color=MUTED, lw=0.7)
     if noise_floor_g is not None:
         for factor in (2, 1):
@@ -160,7 +160,7 @@ def _noise_band(axes: Axes, noise_floor_g: float | None, unit: ErrorUnit) -> Non
 
 
 def _residuals(
-    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, colour: str, unit: ErrorUnit
+    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, colour: str, unit: tc.units.ErrorUnit
 ) -> None:
     """With one standard error of the pose either way, as far as it is known."""
     assert stage.pose_residual_g is not None
@@ -197,7 +197,7 @@ def _mark_moments(axes: Axes, moments: Mapping[str, float] | None) -> None:
 
 
 def _mark_conspicuous(
-    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, unit: ErrorUnit
+    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, unit: tc.units.ErrorUnit
 ) -> None:
     """Numbers beside the poses a metrologist looks up first: not used, or far
     out for their noise."""

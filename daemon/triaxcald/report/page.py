@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from triaxcal.text.traces import SMOOTH
+import triaxcal as tc
 from triaxcal_drivers.roles import LINEAR
 from triaxcald import text
 from triaxcald.certificate import Certified
@@ -166,7 +166,7 @@ def render_report(
     return _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
-        smooth=SMOOTH,
+        smooth=tc.text.traces.SMOOTH,
         unit=unit,
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None, final_word(papers)),
         uncertainty=uncertainty,
@@ -208,7 +208,7 @@ def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[st
 
 def _printable(value: object) -> object:
     if value is None or value == "":
-        return figures.MISSING
+        return tc.rounding.MISSING
     return value if isinstance(value, Markup) else figures.clean(value)
 
 
@@ -223,7 +223,8 @@ def _environment() -> Environment:
     )
     environment.globals["factor"] = factor
     for function in (
-        in_plain, figures.chance, figures.digits, figures.effect_title, figures.fixed, figures.in_full, figures.micro,
+        in_plain, tc.text.traces.effect_title, figures.chance, figures.digits, figures.fixed, figures.in_full,
+        figures.micro,
         figures.expanded, figures.micro_g, figures.p_value, figures.plus_minus, figures.unit_label,
     ):  # fmt: skip
         environment.filters[function.__name__] = function

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from triaxcal.effects import effect_named
-from triaxcal.effects.runs import BETWEEN_RUNS
+import triaxcal as tc
 from triaxcald.doubts import is_passing
 from triaxcald.report.figures import number
 from triaxcald.report.untrusted import mapping, texts
@@ -65,9 +64,9 @@ def read_device(papers: Mapping[str, object]) -> Device | None:
 def passes(effect: str) -> bool:
     """Whether an effect of that name is the recording's rather than the unit's."""
     try:
-        return is_passing(effect_named(effect))
+        return is_passing(tc.effects.effect_named(effect))
     except KeyError:
-        return effect in {e.name for e in BETWEEN_RUNS}
+        return effect in {e.name for e in tc.effects.BETWEEN_RUNS}
 
 
 def _checked(known: Mapping[str, object]) -> tuple[tuple[str, float | None], ...]:

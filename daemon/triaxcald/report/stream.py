@@ -10,8 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from triaxcal.poses.pose import Pose
-from triaxcal.poses.stillness.windows import Windows
+import triaxcal as tc
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def thin(time_s: ArrayLike, readings: ArrayLike, points: int = 2000) -> tuple[ND
     return times[rows], values[rows]
 
 
-def overview_of(windows: Windows | None, poses: Sequence[Pose], unit: str) -> StreamOverview | None:
+def overview_of(windows: tc.poses.Windows | None, poses: Sequence[tc.Pose], unit: str) -> StreamOverview | None:
     """The stream from its windows' means; None where there is not one whole
     window."""
     if windows is None:

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
-from triaxcal.text.traces import SMOOTH
-from triaxcal.units import ErrorUnit
+import triaxcal as tc
 from triaxcald.doubts import doubts_of, none_could_show
 from triaxcald.report.document import CANDIDATE, Finding, Outcome
 from triaxcald.report.faults import faults_of
-from triaxcald.report.figures import chance, effect_title, micro_g, ratio
+from triaxcald.report.figures import chance, micro_g, ratio
 from triaxcald.report.meanings import told
 from triaxcald.report.untrusted import mapping
 
@@ -197,13 +195,15 @@ def _found(outcome: Outcome) -> str:
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
-    if not outcome.findings and SMOOTH in outcome.averaged:
+    if not outcome.findings and tc.text.traces.SMOOTH in outcome.averaged:
         return (
             "Something acts that no known effect describes. "
             "The correction is a smooth function of the direction, the mean over all that may act. "
         )
     if not outcome.findings and outcome.averaged:
-        each = ", ".join(f"{effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items())
+        each = ", ".join(
+            f"{tc.text.traces.effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items()
+        )
         return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
     if not outcome.findings and outcome.something_is_left:
         return "Something acts beyond the linear model, and these poses do not tell what. "
@@ -254,7 +254,7 @@ def _unexplained(outcome: Outcome) -> bool:
 
 def _lacks_fit(outcome: Outcome) -> bool:
     p = outcome.final.lack_of_fit_p
-    return p is not None and p < LACK_OF_FIT
+    return p is not None and p < tc.poses.LACK_OF_FIT
 
 
 def _errors(outcome: Outcome) -> str:
@@ -281,7 +281,7 @@ def _errors(outcome: Outcome) -> str:
     return f"{text}; noise floor {micro_g(floor_g, unit)}{in_errors}."
 
 
-def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: ErrorUnit) -> list[str]:
+def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: tc.units.ErrorUnit) -> list[str]:
     """What no residual can show: an error of the reference is the same in every
     pose, and fitted away."""
     least = min((c.limit_g for c in checks if c.limit_g is not None), default=None)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from triaxcal.interchange.calibration_document import Document
+import triaxcal as tc
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, SecondAnswer
 from triaxcald import errors as exit_codes
 from triaxcald import text
@@ -42,7 +42,7 @@ from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
 from triaxcald.verification import WORSE
 
 
-def judged(certificate: Document, verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
+def judged(certificate: tc.interchange.Document, verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
     """The verdict on the figures: on those of the fit in the ``certificate``,
     and on the device's own output if it was written. Nothing else enters, so
     that an audit finds the same."""

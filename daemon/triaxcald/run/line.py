@@ -13,9 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from triaxcal.arrays import Floats
-from triaxcal.interchange.calibration_document import Document
-from triaxcal.model.bias_directions import bias_directions
+import triaxcal as tc
 from triaxcal_drivers.errors import RegisterRefused
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
@@ -77,14 +75,14 @@ class Outcome:
 
     unit: str
     exit_code: int
-    document: Document
+    document: tc.interchange.Document
     held: Held
     recording: Path | None = None
     certificate: Path | None = None
     report: Path | None = None
     outcome: Path | None = None
     certified: Certified | None = None
-    verification: Document | None = None
+    verification: tc.interchange.Document | None = None
     provisioned: Provisioning | None = None
     device_state: str | None = None
     settling: str | None = None
@@ -123,7 +121,7 @@ class UnitRun(UnitSession):
         self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
-        self._document: Document | None = None
+        self._document: tc.interchange.Document | None = None
         self._lost = 0
 
     async def run(self) -> Outcome:
@@ -193,16 +191,16 @@ class UnitRun(UnitSession):
     def _seal(self, writer: RecordingWriter, ending: Ending) -> None:
         """The outcome as the last attachment, with the inventory of all that is
         before it; closes the recording."""
-        made: list[Document] = []
+        made: list[tc.interchange.Document] = []
 
-        def make(contents: Document) -> bytes:
+        def make(contents: tc.interchange.Document) -> bytes:
             made.append(self._outcome_document(ending, contents))
             return to_text(made[0]).encode()
 
         writer.seal(ATTACHMENT, "application/json", make)
         self._document = made[0]
 
-    def _outcome_document(self, ending: Ending, contents: Document | None) -> Document:
+    def _outcome_document(self, ending: Ending, contents: tc.interchange.Document | None) -> tc.interchange.Document:
         certificate = self._certified.document if self._certified else None
         back = self._write_back
         return outcome_document(
@@ -382,11 +380,11 @@ class UnitRun(UnitSession):
         collection: Collection,
         stream: str,
         wanted: int,
-        apart_from: Floats | None = None,
+        apart_from: tc.Floats | None = None,
     ) -> None:
         plan, targets = self.station.file.plan, None
         if self.rezero is not None and stream == READINGS:
-            plan, targets = plan.model_copy(update={"repeat": False}), bias_directions(wanted)
+            plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
         await collection.until_posed(
             device,
             writer,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from triaxcal.interchange.calibration_document import Document
+import triaxcal as tc
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile
@@ -49,7 +49,7 @@ class Provisioned:
     written, if it was."""
 
     exit_code: int
-    document: Document
+    document: tc.interchange.Document
     provisioning: Provisioning | None
     error: str | None
     path: Path | None
@@ -176,7 +176,7 @@ class ProvisionRun:
             return text.rehearsed(self.provisioning)
         return text.provisioned(self.provisioning)
 
-    def _document(self, ending: Ending) -> Document:
+    def _document(self, ending: Ending) -> tc.interchange.Document:
         p = self.provisioning
         return outcome_document(
             ending,
@@ -192,7 +192,7 @@ class ProvisionRun:
             forced=self.force if self.doubts else None,
         )
 
-    def _write(self, document: Document) -> Path:
+    def _write(self, document: tc.interchange.Document) -> Path:
         """Raises InputError."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
         stem = f"{document['serial'] or self.place.unit.name}-{stamp}"

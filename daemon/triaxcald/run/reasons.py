@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import traceback
 
-from triaxcal.errors import TriaxcalError
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError
 from triaxcald.errors import DaemonError
 from triaxcald.memory import out_of_memory, ran_out_of_memory
@@ -28,4 +28,4 @@ def trace_of(e: BaseException) -> str | None:
 
 def is_internal(e: BaseException) -> bool:
     """Whether nobody raises such an error on purpose."""
-    return not isinstance(e, (TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))
+    return not isinstance(e, (tc.TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))

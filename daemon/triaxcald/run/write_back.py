@@ -10,10 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.errors import Refused, TriaxcalError
-from triaxcal.interchange.calibration_document import Document
-from triaxcal.poses.pose import Pose
+import triaxcal as tc
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
@@ -72,7 +69,7 @@ class WriteBack:
     ask: Callable[[str], None]
     started: str
     force: str | None = None
-    verification: Document | None = field(default=None, init=False)
+    verification: tc.interchange.Document | None = field(default=None, init=False)
     verdict: str | None = field(default=None, init=False)
     doubts: Sequence[Doubt] = field(default=(), init=False)
     provisioning: Provisioning | None = field(default=None, init=False)
@@ -122,7 +119,7 @@ class WriteBack:
         except (DiskError, WrongUnit, TwoAnswer):  # said as they are
             await p.undo()
             raise
-        except (DriverError, DaemonError, TriaxcalError) as e:
+        except (DriverError, DaemonError, tc.TriaxcalError) as e:
             await p.undo()
             raise StationError(f"verification failed: {e}") from e
         except BaseException:
@@ -168,7 +165,7 @@ class WriteBack:
         if found.rms_g is None:
             faults = ", ".join(dict.fromkeys(p.fault for p in found.untrusted))
             why = f"no check pose can be trusted: {len(found.poses)} left out ({faults})"
-            raise Refused(why if found.poses else "there is no check pose")
+            raise tc.Refused(why if found.poses else "there is no check pose")
         return str(document["verdict"])
 
     def _attach(self, name: str, raw: Mapping[str, bytes]) -> None:
@@ -181,7 +178,7 @@ def corrected(collection: Collection, reference: float) -> Verification:
     return verified(collection.pipelines[CORRECTED], reference)
 
 
-def _alignments(readings: Sequence[Pose], outputs: Sequence[Pose]) -> Iterator[list[tuple[Pose, Pose]]]:
+def _alignments(readings: Sequence[tc.Pose], outputs: Sequence[tc.Pose]) -> Iterator[list[tuple[tc.Pose, tc.Pose]]]:
     """Poses of the two streams that lie over each other, for each way to lay
     one over the other.
 
@@ -197,7 +194,7 @@ def _alignments(readings: Sequence[Pose], outputs: Sequence[Pose]) -> Iterator[l
             yield [(readings[i], outputs[j]) for i, j in over]
 
 
-def _paired(pairs: Sequence[tuple[Pose, Pose]]) -> tuple[Floats, Floats, dict[str, Floats]]:
+def _paired(pairs: Sequence[tuple[tc.Pose, tc.Pose]]) -> tuple[tc.Floats, tc.Floats, dict[str, tc.Floats]]:
     """Means (n,3) of both streams, and the channels (n,) that every pose has."""
     names = set.intersection(*(set(r.channels) for r, _ in pairs)) if pairs else set()
     return (

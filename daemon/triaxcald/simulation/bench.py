@@ -12,13 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from triaxcal.arrays import Floats, Ints
-from triaxcal.effects import effect_named, effect_of
-from triaxcal.effects.contract import Effect, channel_of
-from triaxcal.errors import InvalidData
-from triaxcal.model.directions import directions, elsewhere
-from triaxcal.model.sensor import Sensor
-from triaxcal.synthetic import COVARIATES, Environment, SyntheticUnit, Tumble
+import triaxcal as tc
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named, load_bundle
 from triaxcal_drivers.modbus.model import ModbusBus
@@ -82,18 +76,18 @@ class DeviceFile(Strict):
 
 
 @dataclass(frozen=True)
-class CheckedTumble(Tumble):
+class CheckedTumble(tc.synthetic.Tumble):
     """Goes through ``tours`` (t,k,3), one after each restart, and then on with
     its own directions."""
 
-    tours: Floats = field(kw_only=True)
+    tours: tc.Floats = field(kw_only=True)
     _begun: list[int] = field(default_factory=list, init=False)
 
     def restarted(self, t_s: float) -> None:
         """It sets out at the next move."""
         self._begun.append(int(t_s // self.step_s) + 1)
 
-    def taken(self, step: Ints) -> Floats:
+    def taken(self, step: tc.Ints) -> tc.Floats:
         found = super().taken(step)
         for i, first in enumerate(self._begun):
             tour = self.tours[i % len(self.tours)]
@@ -106,7 +100,7 @@ class CheckedTumble(Tumble):
 class SyntheticPhysics:
     """Binds the metrology's synthetic unit to the simulated electronics."""
 
-    unit: SyntheticUnit
+    unit: tc.synthetic.SyntheticUnit
     fixture: CheckedTumble
 
     def sample(self, unit_time_s: Any) -> tuple[Any, Any]:
@@ -130,34 +124,34 @@ def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics
     ``where`` names the file in it."""
     effects = [_effect(name, held, where) for name, held in device.sensor.effects.items()]
     truth = device.sensor
-    sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
+    sensor = tc.Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
     place = device.surroundings
-    environment = Environment(place.temperature_c, place.ramp_c_per_s, place.swing_c, place.swing_period_s)
+    environment = tc.synthetic.Environment(place.temperature_c, place.ramp_c_per_s, place.swing_c, place.swing_period_s)
     fixture = tumble_of(device)
     return SyntheticPhysics(
-        SyntheticUnit(sensor, fixture, np.full(3, truth.noise_g), environment, seed=device.seed), fixture
+        tc.synthetic.SyntheticUnit(sensor, fixture, np.full(3, truth.noise_g), environment, seed=device.seed), fixture
     )
 
 
-def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, Floats]:
+def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[tc.effects.Effect, tc.Floats]:
     """An effect and its coefficients, as a device file has them. Raises
     InputError."""
     here = f"{where}: sensor.effects.{name}"
     try:
-        forms = effect_named(name).forms
+        forms = tc.effects.effect_named(name).forms
     except KeyError:
         raise InputError(f"{here}: no effect of that name is known") from None
     known = list(dict.fromkeys(n for e in forms for n in (*(c.name for c in e.coefficients), *e.shape)))
     try:
-        effect, coefficients = effect_of(name, held)
+        effect, coefficients = tc.effects.effect_of(name, held)
     except KeyError:
         if unknown := set(held) - set(known):
             raise InputError(f"{here}.{min(unknown)}: known coefficients: {', '.join(known)}") from None
         raise InputError(f"{here}: {', '.join(held)} are not of one form of it") from None
     if bad := next((n for n, (v, _) in effect.shape.items() if not v > 0), None):
         raise InputError(f"{here}.{bad}: has to be above 0")
-    if lacking := set(effect.needs) - COVARIATES:
-        needed = ", ".join(map(channel_of, sorted(lacking)))
+    if lacking := set(effect.needs) - tc.synthetic.COVARIATES:
+        needed = ", ".join(map(tc.effects.channel_of, sorted(lacking)))
         raise InputError(f"{here}: a simulated unit has no {needed}, which it goes with")
     return effect, coefficients
 
@@ -167,13 +161,13 @@ def tumble_of(device: DeviceFile) -> CheckedTumble:
     check by; each off by the fixture's attitude error."""
     fixture = device.fixture
     try:
-        plan = np.array([v for _, v in directions(fixture.poses)])
-    except InvalidData as e:
+        plan = np.array([v for _, v in tc.planning.directions(fixture.poses)])
+    except tc.InvalidData as e:
         raise InputError(f"fixture.poses: {e}") from e
     rng = np.random.default_rng([device.seed, 1])
     taken = plan
     for _ in range(CHECK_TOURS):
-        taken = np.concatenate([taken, [v for _, v in elsewhere(taken, CHECK_POSES)]])
+        taken = np.concatenate([taken, [v for _, v in tc.planning.elsewhere(taken, CHECK_POSES)]])
     off = taken + rng.standard_normal(taken.shape) * np.radians(fixture.attitude_error_deg)
     off /= np.linalg.norm(off, axis=1, keepdims=True)
     n = len(plan)

@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
-from triaxcal.arrays import Floats
+import triaxcal as tc
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
@@ -25,9 +25,6 @@ from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.raw_records import RawRecords
-
-if TYPE_CHECKING:
-    from triaxcal.model.directions import Direction
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the
@@ -232,8 +229,8 @@ class Collection(Recorded):
         wanted: int,
         nominal_scale_factor: Sequence[float] | None,
         tell: Callable[[Guide], None],
-        apart_from: Floats | None = None,
-        targets: Sequence[Direction] | None = None,
+        apart_from: tc.Floats | None = None,
+        targets: Sequence[tc.planning.Direction] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records until ``stream`` shows ``wanted`` distinct poses, and of the
@@ -250,9 +247,7 @@ class Collection(Recorded):
         lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
         counted_s: tuple[float, ...] = ()
         if stream == READINGS and targets is None:
-            from triaxcal.model.directions import directions
-
-            directions(wanted)  # put in order once, before there are samples to lose
+            tc.planning.directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for batch in records:

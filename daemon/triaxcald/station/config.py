@@ -11,12 +11,11 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
-from triaxcal.model.gravity import local_gravity_g
-from triaxcal.model.samples import Moment
+import triaxcal as tc
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import driver_named, load_bundle
 from triaxcal_drivers.claim import claim_of
@@ -30,10 +29,6 @@ from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
 from triaxcald.station.coming_back import Patience, claimed, until_open
-
-if TYPE_CHECKING:
-    from triaxcal.uncertainty import Stated
-
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -143,21 +138,20 @@ class StationFile(Strict):
         """Local gravity in g: as given, or by the place's normal gravity, or 1
         where the unit is local gravity."""
         if self.latitude_deg is not None and self.height_m is not None:
-            return local_gravity_g(self.latitude_deg, self.height_m)[0]
+            return tc.local_gravity_g(self.latitude_deg, self.height_m)[0]
         return 1.0 if self.given_reference is None else self.given_reference
 
     @property
-    def moment(self) -> Moment | float:
+    def moment(self) -> tc.Moment | float:
         """As `triaxcal.diagnosis.diagnose` has it."""
-        return Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
+        return tc.Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
-    def stated(self, profile: Profile) -> Stated:
+    def stated(self, profile: Profile) -> tc.Stated:
         """What the station says of uncertainties, and the device's ``profile``
         of its thermal sensitivity."""
-        from triaxcal.uncertainty import Stated  # the fit and all: no recorder needs it
 
         own = self.thermal_sensitivity_per_k
-        return Stated.at(
+        return tc.Stated.at(
             self.latitude_deg,
             self.height_m,
             self.reference_uncertainty,
@@ -352,9 +346,7 @@ def _check_roles(bundle: Bundle, *, where: str) -> None:
     InputError with the nearest one."""
     known = list(LINEAR_ROLES)
     if any(r.role not in (None, *known, *OTHER_ROLES) for r in bundle.profile.registers.values()):
-        from triaxcal.effects import CATALOGUE  # of a device that holds none, it is not needed
-
-        known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
+        known += [f"{e.name}.{c.name}" for e in tc.effects.CATALOGUE for c in e.coefficients]
     known += OTHER_ROLES
     for name, register in bundle.profile.registers.items():
         if register.role is not None and register.role not in known:

@@ -5,15 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-
-if TYPE_CHECKING:
-    from triaxcal.model.directions import Direction
-    from triaxcal.poses.pose import StillSpan
+import triaxcal as tc
 
 COVERED_DEG = 25.0
 """A pose covers the direction of the plan that it is nearest to, up to this far
@@ -50,7 +45,7 @@ class Guide:
 
 
 def guide(
-    poses: Sequence[StillSpan],
+    poses: Sequence[tc.StillSpan],
     *,
     wanted: int,
     hold_s: float,
@@ -60,8 +55,8 @@ def guide(
     plan: bool = True,
     repeat: bool = False,
     counted_s: Collection[float] = (),
-    apart_from: Floats | None = None,
-    targets: Sequence[Direction] | None = None,
+    apart_from: tc.Floats | None = None,
+    targets: Sequence[tc.planning.Direction] | None = None,
 ) -> Guide:
     """Judge the poses so far, which may come in any order; ``repeat`` asks for
     the first of them again at the end.
@@ -84,9 +79,9 @@ def guide(
     enough = [p.end_s - p.start_s >= hold_s or any(p.start_s <= t <= p.end_s for t in counted_s) for p in poses]
     held = [v for v, is_enough in zip(up, enough, strict=True) if is_enough]
     taken = [] if apart_from is None else list(apart_from)
-    distinct: list[Floats] = []
-    since: list[Floats] = []
-    others: list[Floats] = []
+    distinct: list[tc.Floats] = []
+    since: list[tc.Floats] = []
+    others: list[tc.Floats] = []
     for v in held:
         if _near(v, taken, apart_deg):
             if not _near(v, others, apart_deg):
@@ -99,10 +94,11 @@ def guide(
     found = len(distinct)
     in_all = found + len(others)
     only_near = bool(taken) and found < wanted <= in_all and in_all >= min(2 * wanted, len(taken))
-    from triaxcal.model.directions import directions, elsewhere  # a recorder guides nobody
 
     if targets is None:
-        targets = directions(wanted) if plan else elsewhere(np.array(taken), wanted) if taken else []
+        targets = (
+            tc.planning.directions(wanted) if plan else tc.planning.elsewhere(np.array(taken), wanted) if taken else []
+        )
     missing = _uncovered(targets, held) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
     if (found >= wanted or only_near) and not due:
@@ -119,11 +115,11 @@ def guide(
     return Guide(found, wanted, still_s, hint, missing, due, middles, only_near)
 
 
-def _near(v: Floats, others: Sequence[Floats], degrees: float) -> bool:
+def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
     return any(float(v @ d) >= np.cos(np.radians(degrees)) for d in others)
 
 
-def _uncovered(targets: Sequence[Direction], held: Sequence[Floats]) -> tuple[str, ...]:
+def _uncovered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats]) -> tuple[str, ...]:
     if not targets or not held:
         return tuple(label for label, _ in targets)
     cosines = np.array(held) @ np.array([v for _, v in targets]).T
@@ -133,14 +129,14 @@ def _uncovered(targets: Sequence[Direction], held: Sequence[Floats]) -> tuple[st
     return tuple(label for i, (label, _) in enumerate(targets) if i not in covered)
 
 
-def _nearest(targets: Sequence[Direction], v: Floats) -> str:
+def _nearest(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> str:
     if not targets:
         return ""
     label, _ = max(targets, key=lambda target: float(target[1] @ v))
     return f"{_said(label, targets)} "
 
 
-def _said(label: str, targets: Sequence[Direction]) -> str:
+def _said(label: str, targets: Sequence[tc.planning.Direction]) -> str:
     """The axes that point up; for a direction that only a number names, its
     components."""
     if label.startswith(("+", "-")):
@@ -149,7 +145,7 @@ def _said(label: str, targets: Sequence[Direction]) -> str:
     return f"{label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
 
 
-def ups(poses: Sequence[StillSpan], nominal: Sequence[float] | None) -> Floats:
+def ups(poses: Sequence[tc.StillSpan], nominal: Sequence[float] | None) -> tc.Floats:
     """Up in the unit's frame, roughly: by the nominal scale factor, else by the
     range of the outputs so far."""
     if not poses:

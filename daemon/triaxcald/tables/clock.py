@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.number_format import plain
+import triaxcal as tc
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.naming import ISO, Name, Unclear
 from triaxcald.tables.naming import NANOSECONDS as UNITS
@@ -98,7 +98,9 @@ def require_seconds(time_ns: NDArray[np.int64], column: str) -> None:
 
 def _evenly(counted: NDArray[np.int64], rate: float) -> NDArray[np.int64]:
     if len(counted) and counted[-1] / rate > 9.2e9:
-        raise Unclear(f"--rate {plain(rate)}: {len(counted)} samples would take longer than can be counted")
+        raise Unclear(
+            f"--rate {tc.number_format.plain(rate)}: {len(counted)} samples would take longer than can be counted"
+        )
     return np.asarray(np.rint(counted * (UNITS["s"] / rate)).astype(np.int64))
 
 
@@ -121,7 +123,7 @@ def _evident(
     kind = "integers" if whole else "numbers"
     options = ", ".join(f"{u} would be {_rate(step * UNITS[u] / UNITS['s'])}" for u in UNITS)
     raise Unclear(
-        f"{_called(name)}: {kind} in steps of {plain(step)} in a unit that nothing states; say which: "
+        f"{_called(name)}: {kind} in steps of {tc.number_format.plain(step)} in a unit that nothing states; say which: "
         f"--time-unit s, ms, us or ns ({options}), or --time-unit index --rate HZ"
     )
 
@@ -138,7 +140,7 @@ def _rate(step_s: float) -> str:
     hertz = 1 / step_s
     for factor, unit in ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"), (1.0, "Hz"), (1e-3, "mHz")):
         if hertz >= factor:
-            return f"{plain(hertz / factor)} {unit}"
+            return f"{tc.number_format.plain(hertz / factor)} {unit}"
     return f"a sample every {step_s:.3g} s"
 
 
@@ -147,7 +149,9 @@ def _scaled(column: Column, name: Name, unit: str) -> NDArray[np.int64]:
     usable = column.usable
     held = np.where(usable, column.numbers, 0.0)
     if np.abs(held).max(initial=0.0) >= 2**63 / scale:
-        raise Unclear(f"{_called(name)} goes to {plain(float(np.abs(held).max()))}, which are too many {unit}")
+        raise Unclear(
+            f"{_called(name)} goes to {tc.number_format.plain(float(np.abs(held).max()))}, which are too many {unit}"
+        )
     if column.whole is not None:
         return np.where(usable, column.whole, 0) * scale
     whole = np.floor(held)  # apart, so that seconds since 1970 keep their nanoseconds as far as a float has them

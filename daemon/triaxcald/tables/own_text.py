@@ -14,7 +14,7 @@ from typing import BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.documents import OUT, UNCERTAINTY
+import triaxcal as tc
 from triaxcal_drivers.hints import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables.source import blocks, label_of
@@ -80,7 +80,10 @@ def _fields_of(line: str) -> list[str]:
 def is_applied(names: Sequence[str]) -> bool:
     """Whether a table of our own layout with these columns is what
     `triaxcal apply` writes."""
-    return any(tuple(names[-len(behind) :]) == behind for behind in (OUT, OUT + UNCERTAINTY))
+    return any(
+        tuple(names[-len(behind) :]) == behind
+        for behind in (tc.documents.OUT, tc.documents.OUT + tc.documents.UNCERTAINTY)
+    )
 
 
 def header_of(data: bytes, label: str) -> tuple[str, tuple[str, ...], int]:

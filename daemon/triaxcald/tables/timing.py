@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.number_format import plain
+import triaxcal as tc
 from triaxcal_drivers.hints import clipped
 from triaxcald.tables import clock
 from triaxcald.tables.arrow import Column
@@ -67,7 +67,7 @@ def timing_of(
     if rate is not None:
         counters = [*(roles.time[:1] if by_index or TIME in roles.said else ()), *roles.indices]
         index = next(iter(counters), None)
-        return Timing(None, None, f"{plain(rate, 6)} Hz by {where}", rate, index)
+        return Timing(None, None, f"{tc.number_format.plain(rate, 6)} Hz by {where}", rate, index)
     return _timed(grid, candidates, names, time_unit, chosen)
 
 
@@ -135,7 +135,7 @@ def _timed(
     lasted = {i: _lasted_s(t, chosen & grid.columns[i].usable) for _, i, t, _ in rising}
     longest, shortest = max(lasted.values()), min(lasted.values())
     if longest - shortest > 2 + 0.01 * abs(longest):
-        both = ", ".join(f"{grid.called(i)} {plain(s)} s" for i, s in lasted.items())
+        both = ", ".join(f"{grid.called(i)} {tc.number_format.plain(s)} s" for i, s in lasted.items())
         raise Unclear(f"columns of time that do not agree how long it took ({both}); choose one: --columns t=NAME")
     _, i, time_ns, known = rising[0]
     return Timing(time_ns, i, "dates" if known == ISO else known)
