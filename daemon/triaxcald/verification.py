@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import triaxcal as tc
+from triaxcald.computer import compute_with_one_thread
 from triaxcald.pipeline import Pipeline, of_poses
-from triaxcald.software import compute_with_one_thread
 from triaxcald.station.guidance import ups
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"

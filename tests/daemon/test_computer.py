@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from threadpoolctl import threadpool_info
 
-from triaxcald.software import BLAS, KERNEL, KEYS, PROCESSOR, compute_with_one_thread, computer
+from triaxcald.computer import BLAS, KERNEL, KEYS, PROCESSOR, compute_with_one_thread, computer
 
 THREADS = """
 import json
@@ -35,7 +35,7 @@ def run(code: str, **environment: str) -> Any:
 @pytest.mark.parametrize(
     "code",
     [
-        "from triaxcald.software import compute_with_one_thread\ncompute_with_one_thread()\nimport scipy.optimize",
+        "from triaxcald.computer import compute_with_one_thread\ncompute_with_one_thread()\nimport scipy.optimize",
         "from triaxcald.cli.commands import main\nmain(['plan', '--json'])",
         "from triaxcald.cli.commands import main\nmain(['audit', '/nowhere.mcap'])\nimport scipy.linalg",
     ],
@@ -65,7 +65,7 @@ def test_the_computer_is_named_by_processor_library_and_kernel() -> None:
 
 @pytest.mark.slow
 def test_the_kernel_is_the_one_that_computes() -> None:
-    code = "import json\nfrom triaxcald.software import computer\nprint(json.dumps(computer()))"
+    code = "import json\nfrom triaxcald.computer import computer\nprint(json.dumps(computer()))"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "OPENBLAS_CORETYPE": "Nehalem"},

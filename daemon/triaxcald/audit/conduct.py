@@ -31,6 +31,7 @@ from triaxcald.audit.results import (
     report_of,
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
+from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
@@ -43,7 +44,7 @@ from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_
 from triaxcald.recording.survey import Survey, survey
 from triaxcald.run.line import CERTIFICATE, REPORT
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
-from triaxcald.software import KEYS, computer, drawn_with, software
+from triaxcald.software import drawn_with, software
 
 NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)
 Compute = Callable[[Recording, Digests], Again]

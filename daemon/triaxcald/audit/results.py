@@ -13,6 +13,7 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
+from triaxcald.computer import compute_with_one_thread
 from triaxcald.decoded import DecodedStream
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
@@ -28,7 +29,6 @@ from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.line import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
-from triaxcald.software import compute_with_one_thread
 from triaxcald.station.config import StationFile, parse_station
 from triaxcald.verification import (
     Apart,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -15,6 +16,9 @@ from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
 
 BAD_INPUT = 2
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Settings of the libraries of linear algebra, which they read when they are
+loaded. Figures must not depend on how many threads a computer has."""
 
 
 def parser() -> OneLineParser:
@@ -75,10 +79,11 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
     """The command, imported when it is called."""
 
     def work() -> int:
+        os.environ.update(dict.fromkeys(THREADS, "1"))
         module, _, name = chosen.run.partition(":")
         command = getattr(import_module(f"triaxcald.cli.{module}"), name)
-        if "scipy" in sys.modules:  # it may compute
-            from triaxcald.software import compute_with_one_thread
+        if "scipy" in sys.modules:  # too late for the environment
+            from triaxcald.computer import compute_with_one_thread
 
             compute_with_one_thread()
         if not gc.isenabled():  # as the program begins

@@ -18,7 +18,7 @@ import pytest
 from tests.daemon.audit.forging import OUTCOME, Forgery
 from triaxcald.audit import text
 from triaxcald.audit.conduct import Result
-from triaxcald.software import KERNEL, KEYS
+from triaxcald.computer import KERNEL, KEYS
 
 pytestmark = pytest.mark.slow
 
