@@ -16,8 +16,7 @@ from triaxcald.audit import audit
 from triaxcald.run.line import Outcome, run_station
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.modbus_unit import ModbusMap, pty_pair
-from triaxcald.station.config import load_station
-from triaxcald.station.lines import check_lines
+from triaxcald.station.config import check_lines, load_station
 
 pytestmark = pytest.mark.slow
 

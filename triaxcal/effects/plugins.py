@@ -17,8 +17,7 @@ from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR
 from triaxcal.effects.contract import DERIVED, RUN, SINCE_START, Effect, Meaning
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.runs import BETWEEN_RUNS
-from triaxcal.effects.wrapped import Wrapped
+from triaxcal.effects.runs import BETWEEN_RUNS, Wrapped
 from triaxcal.errors import InvalidData
 
 GROUP = "triaxcal.effects"

@@ -17,8 +17,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import RUN, Effect
-from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, longest, of_clocks
-from triaxcal.effects.wrapped import Wrapped
+from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, Wrapped, longest, of_clocks
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit

@@ -11,8 +11,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
-from triaxcal.effects.runs import of_clocks
-from triaxcal.effects.wrapped import Wrapped
+from triaxcal.effects.runs import Wrapped, of_clocks
 from triaxcal.model.directions import FULL, linear_design
 from triaxcal.model.sensor import LINEAR
 

@@ -21,6 +21,7 @@ from triaxcald.cli.results import (
     chance_of,
     cross_validated,
     held_at,
+    show_budget,
     show_calibration,
     show_coefficients,
     show_loop,
@@ -30,6 +31,8 @@ from triaxcald.cli.results import (
 )
 from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling_data_quality, warn
 from triaxcald.cli.syntax import writable
+from triaxcald.documents import rezero_document
+from triaxcald.earlier import EarlierFile
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, read_document, require_unit
@@ -623,8 +626,8 @@ def write_results(
     if measured.unit:
         document["unit"] = dict(measured.unit)  # so that it cannot be written to another
     if a.report:  # before anything is written
+        from triaxcald.report.charts import overview_of
         from triaxcald.report.page import render_report  # matplotlib, which nothing else needs
-        from triaxcald.report.stream import overview_of
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.report:
@@ -638,3 +641,59 @@ def write_results(
 def title_of(name: str) -> str:
     """Of a report: the file's name, wherever it lies."""
     return "standard input" if name == "-" else Path(name).name
+
+
+# rezero.
+
+
+def rezero_command(a: argparse.Namespace) -> int:
+    writable(a.output)
+    writable(a.report)
+    file = EarlierFile.read(a.calibration)
+    earlier = file.calibration
+    measured = read_recording(a, a.recording, wanted_by=earlier)
+    said = chosen(a, measured)
+    file.require_of(
+        measured.name,
+        serial=(measured.unit or {}).get("serial"),
+        signs=a.sign or measured.signs,
+        reference=a.reference or measured.reference,
+        reference_unit=a.reference_unit,
+        output_unit=said.output_unit,
+    )
+    choice = replace(
+        said,
+        reference=earlier.fitted.reference,
+        output_unit=said.output_unit or earlier.output_unit,
+        reference_unit=earlier.reference_unit,
+    )
+    with telling_data_quality(measured):
+        found = tc.inputs.updated_biases(measured.poses, file.known(title_of(measured.name)), first=a.poses)
+    loop = rezero_document(
+        found,
+        data_quality=measured.data_quality,
+        output_unit=choice.output_unit,
+        reference_unit=choice.reference_unit,
+        stated=choice.stated,
+    )
+    document = loop["calibration"] | {"data_quality": measured.data_quality}
+    if file.serial:
+        document["unit"] = dict(file.document["unit"])
+    write_results(a, measured, document, loop)
+    if a.json:
+        emit(document)
+    else:
+        _show(found, choice)
+        warn([*map(tc.text.caution, found.cautions), *measured.data_quality])
+    if a.poses is not None and len(found.poses) < a.poses:
+        warn([f"--poses {a.poses}: {measured.name} has {len(found.poses)} distinct poses"])
+    return judge(a.limit, found.residual.rms_g, found.reference)
+
+
+def _show(found: tc.estimate.Calibration, choice: Choice) -> None:
+    b = tc.uncertainty.budget(found, choice.stated)
+    show_coefficients(found, choice, b.parameters)
+    assert found.update is not None
+    for line in tc.text.bias_update.lines(found, found.update, choice.small):
+        show(line)
+    show_budget(b, choice)

@@ -18,8 +18,7 @@ from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError, severest
-from triaxcald.station.config import load_station
-from triaxcald.station.lines import check_lines
+from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit

@@ -30,9 +30,8 @@ from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.recording.schema import Phase
 from triaxcald.station.buses import BusPlace
-from triaxcald.station.config import Place, Station, changed, load_station
+from triaxcald.station.config import Place, Station, changed, check_lines, load_station
 from triaxcald.station.guidance import Guide
-from triaxcald.station.lines import check_lines
 
 if TYPE_CHECKING:
     from triaxcald.run.recording import AtRecording, Kept, Roster

@@ -380,7 +380,7 @@ def _on_recordings(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p = _command(
-        commands, "rezero", "rezeroing:rezero_command", "renew the three biases of a calibration by a few poses",
+        commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",
         "Scale factors, misalignments and effects are kept; three distinct poses are needed, four are better.",
         "rezero cal.json rec.csv --poses 4 -o cal2.json",
     )  # fmt: skip
@@ -389,7 +389,7 @@ def _on_recordings(commands: Any) -> None:
     p.add_argument("--poses", type=count, metavar="N", help="the first N distinct poses; default: all")
     _add_files(p)
     p = _command(
-        commands, "apply", "applying:apply_command", "calibrated readings of a recording",
+        commands, "apply", "measuring:apply_command", "calibrated readings of a recording",
         "Writes its samples with ax, ay, az behind them, in the unit of the reference vector (g, unless the "
         "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
     )  # fmt: skip

@@ -19,8 +19,7 @@ from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports import text
-from triaxcald.imports.importing import Imported, Importing, Record, write_recording
-from triaxcald.imports.times import Ticks, Times
+from triaxcald.imports.importing import Imported, Importing, Record, Ticks, Times, write_recording
 
 # Which frames of a log are those of one unit: by the identifiers of its profile,
 # its node and its bus.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,9 +19,63 @@ from triaxcal_drivers.mcap.messages import MessageSchema
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports import text
-from triaxcald.imports.channels import Channels, listed
-from triaxcald.imports.importing import Imported, Importing, Record, write_recording
-from triaxcald.imports.times import Times
+from triaxcald.imports.importing import Imported, Importing, Record, Times, write_recording
+
+# Whose messages those of a topic are, where several publish on it: an MCAP file has
+# a channel for each.
+
+CHANNELS_SHOWN = 8  # channels in a message
+
+
+@dataclass
+class Channels:
+    """Takes the messages of a profile's ``topics``, of one channel each.
+    ``only`` is the one that the user asked for, which says nothing of other
+    topics than its own."""
+
+    topics: Collection[str]
+    only: Channel | None = None
+    elsewhere: int = 0  # messages of other channels of its topic
+    _seen: Counter[Channel] = field(default_factory=Counter)
+    _latest: dict[str, int] = field(default_factory=dict)  # channel by topic
+    _mixed: set[str] = field(default_factory=set)  # topics
+
+    def takes(self, channel: Channel) -> bool:
+        topic, number = channel.topic, channel.number
+        if self.only is not None and topic == self.only.topic and number != self.only.number:
+            self.elsewhere += 1
+            return False
+        if self._latest.get(topic) != number:
+            if channel in self._seen:
+                self._mixed.add(topic)
+            self._latest[topic] = number
+        self._seen[channel] += 1
+        return True
+
+    def settle(self, name: str) -> bool:
+        """Whether a topic's messages come on one channel after another, once
+        all have been seen, as where a publisher is started anew. Raises
+        InputError where they come on several in turn."""
+        if self._mixed:
+            topic = min(self._mixed)
+            its = listed((channel, count) for channel, count in self._seen.items() if channel.topic == topic)
+            raise InputError(
+                f"{name}: topic '{clipped(topic)}' comes on the channels {its}; --channel says which is the unit's"
+            )
+        return len(self._seen) > len(self._latest)
+
+
+def listed(counted: Iterable[tuple[Channel, int]]) -> str:
+    """Channels by number, each with what its publisher says of itself and no
+    other does, and how many messages it has."""
+    counts = list(counted)
+    common = set.intersection(*(set(channel.metadata) for channel, _ in counts)) if counts else set()
+    shown = []
+    for channel, count in counts[:CHANNELS_SHOWN]:
+        own = [f"{clipped(key)} {clipped(value)}" for key, value in channel.metadata if (key, value) not in common]
+        shown.append(f"{channel.number} ({', '.join([*own[:1], tc.number_format.number_of(count, 'message')])})")
+    return ", ".join(shown) + (", …" if len(counts) > CHANNELS_SHOWN else "")
+
 
 MESSAGE_MOST = 65535  # bytes of a raw record
 STAMPS_LOOKED_AT = 10_000  # messages by whose stamps it is told whether they move

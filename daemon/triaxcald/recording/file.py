@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
+from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcald.errors import DiskError, ProvisionError, TwoAnswer
 from triaxcald.files import exists_already, synchronise
 from triaxcald.recording import disk, schema
-from triaxcald.recording.inventory import Document, Inventory
 from triaxcald.recording.raw_batch import encode_raw
+from triaxcald.recording.retention import Document, Inventory
 
 CHUNK_NS = 1_000_000_000
 """After so long the operating system has a record. Counted from when it was
@@ -246,3 +249,26 @@ class RecordingFile:
 
 def _create(path: Path) -> BinaryIO:
     return open(path, "xb")
+
+
+# Why a recording came to its end, as its last event says it.
+
+ENDED = "ended"
+EndedBecause = Literal["asked", "signal", "disk", "unit gave up", "bus gave up", "failed"]
+Kind = Literal["unit", "bus"]
+
+
+def ended_because(error: BaseException | None, of: Kind = "unit") -> EndedBecause:
+    """``error`` is what the recording was left with, None where it was to end;
+    ``of`` what was recorded."""
+    match error:
+        case None:
+            return "asked"
+        case DiskError():
+            return "disk"
+        case asyncio.CancelledError() | KeyboardInterrupt():
+            return "signal"
+        case DriverError() | ProvisionError() | TwoAnswer():
+            return "unit gave up" if of == "unit" else "bus gave up"
+        case _:
+            return "failed"

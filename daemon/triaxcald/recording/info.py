@@ -10,7 +10,7 @@ from typing import Any
 from triaxcald.recording import schema
 from triaxcald.recording.bus import describe_bus, is_of_bus
 from triaxcald.recording.contents import Contents
-from triaxcald.recording.ending import ENDED
+from triaxcald.recording.file import ENDED
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.series import Series, open_recording
 

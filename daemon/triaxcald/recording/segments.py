@@ -23,14 +23,12 @@ from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
-from triaxcald.recording.ending import ended_because
-from triaxcald.recording.file import Head, RecordingFile
-from triaxcald.recording.inventory import Document
+from triaxcald.recording.file import Head, RecordingFile, ended_because
 from triaxcald.recording.manifest import Manifest, Segment, manifest_path
 from triaxcald.recording.rebuild import open_manifest, settled
 from triaxcald.recording.retention import SEGMENT_BYTES as SEGMENT_BYTES
 from triaxcald.recording.retention import SEGMENT_S as SEGMENT_S
-from triaxcald.recording.retention import Retention, Surplus, delete, surplus
+from triaxcald.recording.retention import Document, Retention, Surplus, delete, surplus
 from triaxcald.recording.series import digest_of
 from triaxcald.recording.writer import RecordingWriter
 

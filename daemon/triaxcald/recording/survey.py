@@ -26,9 +26,9 @@ from mcap.records import (
 
 from triaxcald.recording import schema
 from triaxcald.recording.frames import HEAD, Frame, chunk_data, chunk_records, parse, whole_chunk_head
-from triaxcald.recording.inventory import Inventory
 from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.retention import Inventory
 
 Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
 AFTER_THE_END = (schema.RAW_RECORD, schema.END_RECORD, schema.RECOVERY_RECORD)

@@ -20,9 +20,8 @@ from triaxcald.errors import RecordingError
 from triaxcald.files import require_new
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording import disk, schema
-from triaxcald.recording.ending import ENDED, EndedBecause
-from triaxcald.recording.file import SYNC_S, Head, RecordingFile
-from triaxcald.recording.inventory import Document
+from triaxcald.recording.file import ENDED, SYNC_S, EndedBecause, Head, RecordingFile
+from triaxcald.recording.retention import Document
 
 LOOK_S = 1.0
 """A writer that is given nothing looks about so often, since a segment grows old

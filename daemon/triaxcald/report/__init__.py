@@ -1,7 +1,7 @@
 """The report room: one self-contained HTML page from the documents of a
 calibration."""
 
+from triaxcald.report.charts import StreamOverview, thin
 from triaxcald.report.page import render_report
-from triaxcald.report.stream import StreamOverview, thin
 
 __all__ = ["StreamOverview", "render_report", "thin"]

@@ -6,17 +6,137 @@ still come out, with a dash where a value is missing."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import PurePath
 
 import numpy as np
+from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcald.report.figures import clean, number
-from triaxcald.report.stages import HoldOut, Residual, Stage, held_out_of, stages_of
-from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
+from triaxcald.doubts import is_passing
+from triaxcald.report.figures import clean, micro_g, number
+from triaxcald.report.meanings import QUALITY
+
+# Values of a document, read without trust: what is missing or of the wrong kind
+# counts as missing.
+
+Vector = tuple[float, float, float]
+
+
+def mapping(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def texts(value: object) -> tuple[str, ...]:
+    """A list of sentences or names; an entry with keys becomes `key: value;
+    key: value`."""
+    entries = value if isinstance(value, (list, tuple)) else [] if value is None else [value]
+    return tuple(words(entry) for entry in entries if entry is not None)
+
+
+def vector(value: object) -> Vector | None:
+    """Three finite numbers, or None."""
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
+        return None
+    x, y, z = (number(component) for component in value)
+    return None if x is None or y is None or z is None else (x, y, z)
+
+
+def numbers(value: object) -> dict[str, float | None]:
+    return {str(name): number(entry) for name, entry in mapping(value).items()}
+
+
+def words(entry: object) -> str:
+    if isinstance(entry, Mapping):
+        return "; ".join(f"{key}: {value}" for key, value in entry.items())
+    return str(entry)
+
+
+# The plain model, the one that is handed on, and the errors of each.
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Errors of the magnitude in g, and the probability that pure noise leaves
+    as much."""
+
+    rms_g: float | None = None
+    max_abs_g: float | None = None
+    cross_validated_rms_g: float | None = None
+    noise_floor_g: float | None = None
+    lack_of_fit_p: float | None = None
+    weighted_rms: float | None = None
+    reduced_chi2: float | None = None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A model: its errors and, where known, the residual of every pose in g."""
+
+    label: str
+    residual: Residual
+    held_out_rms_g: float | None = None
+    pose_residual_g: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    before_rms_g: float | None
+    after_rms_g: float | None
+    noise_floor_g: float | None
+    poses: int | None
+    contradicts: bool = False
+    """Whether these poses contradict the calibration."""
+
+
+def residual_of(value: object) -> Residual | None:
+    known = mapping(value)
+    return Residual(*(number(known.get(field.name)) for field in fields(Residual))) if known else None
+
+
+def held_out_of(document: Mapping[str, object]) -> HoldOut | None:
+    known = mapping(document.get("held_out"))
+    if not known:
+        return None
+    poses = number(known.get("poses"))
+    return HoldOut(
+        number(known.get("before_rms_g")),
+        number(known.get("after_rms_g")),
+        number(known.get("noise_floor_g")),
+        None if poses is None else int(poses),
+        known.get("contradicts") is not None,
+    )
+
+
+def stages_of(
+    document: Mapping[str, object],
+    calibration: Mapping[str, object],
+    by_pose_g: tuple[Sequence[float | None], Sequence[float | None]],
+    held_out: HoldOut | None,
+) -> tuple[Stage, ...]:
+    """Before and after; one where they are the same. ``by_pose_g`` has the
+    residuals of both."""
+    before_g, after_g = by_pose_g
+    after = residual_of(document.get("after")) or residual_of(calibration.get("residual"))
+    before = residual_of(document.get("before"))
+    if before is None and after is None:
+        return ()
+    held_after_g = held_out.after_rms_g if held_out else None
+    if before is None or before == after:
+        return (Stage("This model", after or Residual(), held_after_g, _series(after_g)),)
+    first = Stage("Before", before, held_out.before_rms_g if held_out else None, _series(before_g))
+    return (first,) if after is None else (first, Stage("After", after, held_after_g, _series(after_g)))
+
+
+def _series(values: Sequence[float | None]) -> NDArray[np.float64] | None:
+    """Residuals as an array with NaN for a missing one; None when all are
+    missing."""
+    array = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    return None if array.size == 0 or bool(np.isnan(array).all()) else array
+
 
 # The recordings of a document that was made from several.
 
@@ -398,3 +518,128 @@ def _direction(mean: Vector | None, matrix: tuple[Vector, ...] | None, centre: V
     up = np.asarray(matrix) @ (np.asarray(mean) - np.asarray(centre))
     length = float(np.linalg.norm(up))
     return None if length == 0.0 else vector((up / length).tolist())
+
+
+# What spoils poses, told apart from what is merely worth knowing about a recording.
+
+_TAKE_AGAIN = "take again"
+_NAMED = re.compile(rf"(.+?: )?({'|'.join(QUALITY)}): (.*)", re.DOTALL)
+"""A fault, behind the recording's name where there are several."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A line of `data_quality`. ``spoils``: poses that have to be taken again."""
+
+    title: str
+    text: str
+    spoils: bool
+
+
+def faults_of(lines: Iterable[str]) -> tuple[Fault, ...]:
+    """Those that spoil poses first."""
+    found = []
+    for line in lines:
+        named = _NAMED.fullmatch(line)
+        title, text = (QUALITY[named[2]], (named[1] or "") + named[3]) if named else ("", line)
+        found.append(Fault(title, text, _TAKE_AGAIN in line))
+    return tuple(sorted(found, key=lambda fault: not fault.spoils))
+
+
+def left_out(poses: Sequence[Pose], unit: tc.units.ErrorUnit) -> tuple[str, ...]:
+    """The poses that the fit did not use and that are to be taken again, with
+    where they are and by how much they are off."""
+    return tuple(
+        f"Pose {pose.number}"
+        + ("" if pose.start_s is None else f", at {pose.start_s:.1f} s")
+        + (f" of {pose.recording}" if pose.recording else "")
+        + ("" if pose.residual_g is None else f": off by {micro_g(pose.residual_g, unit)}")
+        for pose in poses
+        if pose.again
+    )
+
+
+# What a station put into the device: the registers, and what the device itself then
+# measured.
+
+
+@dataclass(frozen=True)
+class Word:
+    register: str
+    role: str
+    wanted: float | None
+    held: float | None
+    unit: str
+    raw: str
+
+
+@dataclass(frozen=True)
+class Device:
+    """Effects: ``held`` are in its registers, for ``host`` it has none,
+    ``passing`` depend on how the poses were taken. ``checked`` are errors in g
+    of the device's own output; ``state`` says in words what it holds now.
+    """
+
+    state: str
+    not_written: str
+    held: tuple[str, ...]
+    host: tuple[str, ...]
+    passing: tuple[str, ...]
+    rounding_rms_g: float | None
+    checked: tuple[tuple[str, float | None], ...]
+    checked_verdict: str
+    words: tuple[Word, ...]
+
+
+def read_device(papers: Mapping[str, object]) -> Device | None:
+    """None where the certificate tells nothing of a device."""
+    known, checked = mapping(papers.get("registers")), mapping(papers.get("verification"))
+    not_written = str(papers.get("not_written") or "")
+    if not (known or checked or not_written):
+        return None
+    left = texts(known.get("left_to_host"))
+    words = known.get("words")
+    return Device(
+        state=str(papers.get("device") or ""),
+        not_written=not_written,
+        held=tuple(name for name in texts(known.get("terms")) if name != "linear"),
+        host=tuple(name for name in left if not passes(name)),
+        passing=tuple(name for name in left if passes(name)),
+        rounding_rms_g=number(known.get("rounding_rms_g")),
+        checked=_checked(checked),
+        checked_verdict=str(checked.get("verdict") or ""),
+        words=tuple(_word(mapping(entry)) for entry in (words if isinstance(words, list) else [])),
+    )
+
+
+def passes(effect: str) -> bool:
+    """Whether an effect of that name is the recording's rather than the unit's."""
+    try:
+        return is_passing(tc.effects.effect_named(effect))
+    except KeyError:
+        return effect in {e.name for e in tc.effects.BETWEEN_RUNS}
+
+
+def _checked(known: Mapping[str, object]) -> tuple[tuple[str, float | None], ...]:
+    if not known:
+        return ()
+    return (
+        ("With the old registers, rms", number(known.get("before_rms_g"))),
+        ("With the new registers, rms", number(known.get("after_rms_g"))),
+        ("With the new registers, largest", number(known.get("after_max_abs_g"))),
+        ("Noise floor of the check poses", number(known.get("noise_floor_g"))),
+        ("Limit, rms", number(known.get("limit_rms_g"))),
+    )
+
+
+def _word(entry: Mapping[str, object]) -> Word:
+    names = (str(entry.get(key) or "") for key in ("register", "role"))
+    register, role = names
+    return Word(
+        register,
+        role,
+        number(entry.get("wanted")),
+        number(entry.get("held")),
+        str(entry.get("unit") or ""),
+        str(entry.get("raw") or ""),
+    )

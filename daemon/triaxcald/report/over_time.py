@@ -14,10 +14,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcald.report.document import Pose
+from triaxcald.report.document import Pose, Stage
 from triaxcald.report.figures import MICRO_G, clean, unit_label
 from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
-from triaxcald.report.stages import Stage
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8

@@ -20,18 +20,21 @@ from triaxcald.outcome import Ending
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.state import Held
 from triaxcald.report import figures
-from triaxcald.report.before_after import before_after
-from triaxcald.report.charts import bars_picture, bracket, moments_in, sphere_pictures, stream_pictures, trace_panels
-from triaxcald.report.choices import choices_in, who_corrects
-from triaxcald.report.document import read_document
-from triaxcald.report.faults import faults_of, left_out
+from triaxcald.report.charts import (
+    StreamOverview,
+    bars_picture,
+    bracket,
+    moments_in,
+    overview_of,
+    sphere_pictures,
+    stream_pictures,
+    trace_panels,
+)
+from triaxcald.report.document import faults_of, left_out, mapping, numbers, read_device, read_document, texts, vector
 from triaxcald.report.figures import number
 from triaxcald.report.meanings import factor, in_plain, told
 from triaxcald.report.over_time import time_pictures
-from triaxcald.report.registers import read_device
-from triaxcald.report.stream import StreamOverview, overview_of
-from triaxcald.report.untrusted import mapping, numbers, texts, vector
-from triaxcald.report.verdict import final_word, judge
+from triaxcald.report.verdict import before_after, choices_in, final_word, judge, who_corrects
 
 # The uncertainty budget of a calibration document, read without trust like the rest
 # of it.

@@ -3,17 +3,26 @@ what speaks against it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import triaxcal as tc
-from triaxcald.doubts import doubts_of, none_could_show
-from triaxcald.report.document import CANDIDATE, Finding, Outcome
-from triaxcald.report.faults import faults_of
-from triaxcald.report.figures import chance, micro_g, ratio
+from triaxcald.doubts import HOST, PROCESS, REGISTERS, doubts_of, none_could_show
+from triaxcald.report.document import (
+    CANDIDATE,
+    Device,
+    Finding,
+    Outcome,
+    Residual,
+    faults_of,
+    mapping,
+    passes,
+    residual_of,
+    texts,
+)
+from triaxcald.report.figures import chance, micro_g, p_value, ratio
 from triaxcald.report.meanings import told
-from triaxcald.report.untrusted import mapping
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
@@ -309,3 +318,124 @@ def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]
             where = "on the fit" if what == "warning" else "on the quality of the data"
             found.append(f"{count} {what}{'s' if count > 1 else ''} {where}, listed below.")
     return found
+
+
+# The errors before and after, over the same poses: what tells most first.
+
+
+@dataclass(frozen=True)
+class Row:
+    """``before`` is empty where there is one model alone. ``first``: it tells
+    more than the rest."""
+
+    name: str
+    before: str
+    after: str
+    first: bool = False
+
+
+def before_after(outcome: Outcome, unit: tc.units.ErrorUnit) -> tuple[Row, ...]:
+    """None where the document holds no residual."""
+    if not outcome.stages:
+        return ()
+    one = outcome.stages[0].residual if len(outcome.stages) > 1 else None
+
+    def row(name: str, text: Callable[[Residual], str], first: bool = False) -> Row:
+        return Row(name, "" if one is None else text(one), text(outcome.final), first)
+
+    rows = []
+    if held := outcome.held_out:
+        before = "" if one is None else micro_g(held.before_rms_g, unit)
+        rows.append(Row(f"Held-out error, rms in {held.poses} poses", before, micro_g(held.after_rms_g, unit), True))
+    rows += [
+        row("Cross-validated error, rms", lambda r: micro_g(r.cross_validated_rms_g, unit), True),
+        row("Residuals in standard errors, rms", lambda r: ratio(r.weighted_rms), True),
+        row("χ² per degree of freedom", lambda r: ratio(r.reduced_chi2), True),
+        row("Lack of fit, p", lambda r: p_value(r.lack_of_fit_p)),
+        row("Residual, rms", lambda r: micro_g(r.rms_g, unit)),
+        row("Residual, largest", lambda r: micro_g(r.max_abs_g, unit)),
+        row("Noise floor", lambda r: micro_g(r.noise_floor_g, unit)),
+    ]
+    return tuple(rows)
+
+
+# Who corrects what, in words, and the error that each choice leaves in the poses of
+# the fit.
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``who`` says in words who corrects what."""
+
+    who: str
+    residual: Residual
+
+
+def choices_in(document: Mapping[str, object], papers: Mapping[str, object], outcome: Outcome) -> tuple[Choice, ...]:
+    """From the least to the most; empty where there is nothing to choose.
+    Documents from before they had `choices` tell the same by their steps and
+    their registers."""
+    stated = document.get("choices")
+    told = [_read(mapping(entry)) for entry in stated] if isinstance(stated, list) else _reckoned(papers, outcome)
+    passing = tuple(name for name, _ in outcome.effects if passes(name))
+    rows: list[Choice] = []
+    registers: tuple[str, ...] = ("linear",)
+    for by, terms, residual in told:
+        if tuple(by)[:1] == (REGISTERS,) and HOST not in by:
+            registers = tuple(terms)
+        rows.append(Choice(_who(by, terms, registers, passing), residual))
+    return tuple(rows) if len(rows) > 1 or REGISTERS in {name for by, _, _ in told for name in by} else ()
+
+
+def who_corrects(finding: Finding, device: Device | None) -> str:
+    """In use, after the calibration."""
+    if not finding.in_model:
+        return "nobody: it is not in the model"
+    if finding.effect in {effect.name for effect in tc.effects.BETWEEN_RUNS}:
+        return "nobody in advance: it comes anew with every start"
+    if passes(finding.effect):
+        return "nobody: it depends on how these poses were taken; keep it out of the process"
+    if device is None or device.not_written:
+        return "the host, or the device where it has registers for it"
+    return "the device, by its registers" if finding.effect in device.held else "the host: the device has no registers"
+
+
+_Told = tuple[Sequence[str], Sequence[str], Residual]
+
+
+def _read(entry: Mapping[str, object]) -> _Told:
+    return texts(entry.get("corrected_by")), texts(entry.get("terms")), residual_of(entry) or Residual()
+
+
+def _reckoned(papers: Mapping[str, object], outcome: Outcome) -> list[_Told]:
+    known = mapping(papers.get("registers"))
+    unit = ["linear", *(name for name, _ in outcome.effects if not passes(name))]
+    process = [PROCESS] if any(passes(name) for name, _ in outcome.effects) else []
+    first = REGISTERS if known else HOST
+    rows: list[_Told] = []
+    if len(outcome.stages) > 1:
+        rows.append(([first], ["linear"], outcome.stages[0].residual))
+    held = texts(known.get("terms"))
+    if known and (len(held) > 1 or process or not rows):
+        alone = residual_of({"rms_g": known.get("rms_g")}) if set(unit) - set(held) else outcome.final
+        rows.append(([first, *process], held, alone or Residual()))
+    if not known or set(unit) - set(held):
+        rows.append(([first, HOST, *process] if known else [first, *process], unit, outcome.final))
+    return rows
+
+
+def _who(by: Sequence[str], terms: Sequence[str], registers: Sequence[str], passing: Sequence[str]) -> str:
+    parts = []
+    if REGISTERS in by:
+        parts.append("Registers: " + _named_terms([name for name in terms if name in registers]))
+    if HOST in by:
+        left = [name for name in terms if name not in registers] if REGISTERS in by else terms
+        parts.append(f"{'host' if parts else 'Host or registers'}: " + _named_terms(left))
+    if PROCESS in by:
+        parts.append("process: free of " + _named_terms(passing))
+    return "; ".join(parts)
+
+
+def _named_terms(terms: Sequence[str]) -> str:
+    names = ["linear model" if name == "linear" else tc.text.traces.effect_title(name).lower() for name in terms]
+    return ", ".join(names) + (" alone" if names == ["linear model"] else "")

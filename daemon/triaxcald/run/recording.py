@@ -21,7 +21,7 @@ from triaxcald import text
 from triaxcald.errors import DEVICE, DONE, RecordingError, exit_code_of
 from triaxcald.provision.identity import IdentityRead, WrongUnit
 from triaxcald.recording.bus import bus_record, phase_of
-from triaxcald.recording.ending import Kind, ended_because
+from triaxcald.recording.file import Kind, ended_because
 from triaxcald.recording.schema import BUS_RECORD, CALIBRATION, RAW, STATION_FILE
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
 from triaxcald.run.reasons import reason_of, trace_of
@@ -32,9 +32,8 @@ from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station
-from triaxcald.station.listening import Listened, ReturningBus
+from triaxcald.station.listening import Listened, RawRecords, ReturningBus
 from triaxcald.station.lock import locked
-from triaxcald.station.raw_records import RawRecords
 from triaxcald.text import NOTHING_YET
 
 

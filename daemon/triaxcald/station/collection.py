@@ -24,7 +24,7 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
-from triaxcald.station.raw_records import RawRecords
+from triaxcald.station.listening import RawRecords
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the

@@ -1,6 +1,6 @@
 """What is counted of a log's times."""
 
-from triaxcald.imports.times import Ticks, Times
+from triaxcald.imports.importing import Ticks, Times
 
 MS = 1_000_000
 

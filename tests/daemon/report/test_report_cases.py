@@ -13,9 +13,8 @@ import pytest
 
 from triaxcald.report import render_report
 from triaxcald.report.charts import sphere_pictures
-from triaxcald.report.document import read_document
+from triaxcald.report.document import read_device, read_document
 from triaxcald.report.over_time import time_panels
-from triaxcald.report.registers import read_device
 
 _spec = spec_from_file_location("sample_documents", Path(__file__).with_name("sample_documents.py"))
 assert _spec is not None

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from triaxcal.text.traces import effect_title
 from triaxcald.report import StreamOverview, thin
 from triaxcald.report.charts import equal_area
-from triaxcald.report.figures import clean, digits, effect_title, micro_g, number, p_value, plus_minus
+from triaxcald.report.figures import clean, digits, micro_g, number, p_value, plus_minus
 
 
 @pytest.mark.parametrize(

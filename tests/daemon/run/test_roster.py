@@ -14,7 +14,7 @@ from triaxcald.recording.schema import Phase
 from triaxcald.run.recording import AtRecording, Kept, Roster, State
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.guidance import Guide
-from triaxcald.station.raw_records import RawRecords
+from triaxcald.station.listening import RawRecords
 from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP, nothing_deleted
 
 

@@ -26,7 +26,7 @@ from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ConstantPhysics, ReferenceUnit
 from triaxcald.station.collection import Collection, Recorded, _Watch
 from triaxcald.station.config import Plan
-from triaxcald.station.raw_records import OVERRUN
+from triaxcald.station.listening import OVERRUN
 
 Run = Callable[..., Any]
 STOP_S, END_S, BATCH_S = 5.0, 60.0, 0.1

@@ -9,8 +9,7 @@ import pytest
 
 from triaxcal_drivers.errors import DriverError
 from triaxcald.errors import InputError
-from triaxcald.station.config import Station, load_station
-from triaxcald.station.lines import check_lines
+from triaxcald.station.config import Station, check_lines, load_station
 
 CAN0 = {"interface": "socketcan", "channel": "can0"}
 UNIT = {"name": "left", "profile": "triax-ref-can", "bus": {**CAN0, "node_id": 5, "bitrate": 500_000}}

@@ -15,8 +15,7 @@ from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.errors import DriverError
 from triaxcald.errors import InputError
-from triaxcald.station.config import Station, load_station
-from triaxcald.station.lines import check_lines
+from triaxcald.station.config import Station, check_lines, load_station
 
 PROFILE = load_bundle(Path("triax-ref-can")).profile
 
