@@ -2,6 +2,7 @@
 
     python -m benchmarks.frozen --write FILE.jsonl.gz [--jobs 2] [--range development]
     python -m benchmarks.frozen --show benchmarks/results/loop-test.jsonl.gz benchmarks/results/posterior-test.jsonl.gz
+    python -m benchmarks.frozen --paired benchmarks/results/posterior-test.jsonl.gz FILE.jsonl.gz
 
 ``loop-*`` are the results of the search for effects that the posterior has taken the place of.
 
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest, ttest_1samp
 
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
@@ -277,10 +279,48 @@ def reliability(lines: Sequence[Line]) -> Table:
     return Table("Reliability of stated probabilities", ["stated", "n", "mean", "true"], rows)
 
 
+def paired(old: Sequence[Line], new: Sequence[Line]) -> Table:
+    """Differences of ``new`` from ``old`` over the recordings that both have, with Holm's correction over all rows.
+
+    Names right and wrong: the exact test of McNemar. The error: a paired t-test of log(after / before); a recording
+    that was not corrected has the ratio 1.
+    """
+    known = {(one.section, one.kind, one.seed, one.poses, one.noise): one for one in old if not one.error}
+    pairs: dict[tuple[str, int], list[tuple[Line, Line]]] = {}
+    for one in new:
+        before = known.get((one.section, one.kind, one.seed, one.poses, one.noise))
+        if before is not None and not one.error:
+            pairs.setdefault((one.section, one.poses), []).append((before, one))
+    found: list[tuple[list[str], float]] = []
+    for (section, poses), group in pairs.items():
+        for what in ("right", "wrong"):
+            gained = sum(getattr(b, what) and not getattr(a, what) for a, b in group)
+            lost = sum(getattr(a, what) and not getattr(b, what) for a, b in group)
+            p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+            values = [str(sum(getattr(one, what) for one in side)) for side in zip(*group, strict=True)]
+            found.append(([section, str(poses), str(len(group)), f"unique {what}", *values, f"+{gained} −{lost}"], p))
+        logs = np.log([[one.after_g / one.before_g for one in pair] for pair in group])
+        logs = logs[np.isfinite(logs).all(axis=1)]
+        change = logs[:, 1] - logs[:, 0]
+        error = float(change.std(ddof=1) / np.sqrt(len(change)))
+        p = float(ttest_1samp(change, 0.0).pvalue) if error > 0 else 1.0
+        values = [f"{np.exp(v):.3f}" for v in logs.mean(axis=0)]
+        told = f"{change.mean():+.3f} ± {error:.3f}"
+        found.append(([section, str(poses), str(len(change)), "after / before", *values, told], p))
+    # Holm: the k-th smallest of m probabilities is multiplied by m - k, and none is below the one before it.
+    order = np.argsort([p for _, p in found])
+    scaled = np.array([found[i][1] for i in order]) * np.arange(len(found), 0, -1)
+    corrected = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    by_row = dict(zip(order.tolist(), corrected.tolist(), strict=True))
+    rows = [[*row, f"{p:.3f}", f"{by_row[i]:.3f}"] for i, (row, p) in enumerate(found)]
+    return Table("Paired differences", ["truth", "poses", "n", "of", "old", "new", "change", "p", "p (Holm)"], rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, metavar="FILE", help="run the loop and freeze its results")
     parser.add_argument("--show", type=Path, metavar="FILE", nargs="+", default=[], help="tables of frozen results")
+    parser.add_argument("--paired", type=Path, metavar="FILE", nargs=2, help="differences of the second from the first")
     parser.add_argument("--range", choices=RANGES, default="development", help="of seeds")
     parser.add_argument("--share", type=float, default=1.0, help="of the recordings; default all")
     parser.add_argument("--section", help="only this one, in the place of what FILE has of it")
@@ -290,6 +330,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(path)
         print(table(read(path)))
         print(reliability(read(path)))
+    if options.paired:
+        print(paired(*map(read, options.paired)))
     if options.write:
         with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
             asked = [c for c in cases(RANGES[options.range], options.share) if options.section in (None, c[0])]
