@@ -34,8 +34,8 @@ from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 CONTAINERS_MOST = 400_000
-"""Lists and objects of a JSON document: one of a thousand poses has some 20,000,
-and each takes 70 bytes and more."""
+"""Lists and objects of a JSON document, with the brackets inside its texts: one
+of a thousand poses has some 20,000, and each takes 70 bytes and more."""
 PROFILE = PROFILE_FILE
 UNKNOWN_NOISE = "unknown_noise"
 

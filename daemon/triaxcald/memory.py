@@ -46,13 +46,7 @@ def _says_so(e: BaseException) -> bool:
 
 def no_room_left() -> bool:
     """Whether a limit of the address space (``ulimit -v``) is all but used up."""
-    if _limit() is None:
-        return False
-    try:
-        mmap.mmap(-1, _ROOM_BYTES).close()
-    except OSError:
-        return True
-    return False
+    return _limit() is not None and not _fits(_ROOM_BYTES)
 
 
 def require_address_space() -> None:
@@ -63,13 +57,20 @@ def require_address_space() -> None:
     if limit is None:
         return
     wanted = _LIBRARIES_BYTES + _THREAD_BYTES * _threads()
-    try:
-        mmap.mmap(-1, wanted).close()
-    except OSError:
+    if not _fits(wanted):
         raise MemoryError(
             f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for the {wanted >> 20} MiB"
             " of the libraries"
-        ) from None
+        )
+
+
+def _fits(size: int) -> bool:
+    """Whether so many bytes of address space are left."""
+    try:
+        mmap.mmap(-1, size).close()
+    except OSError:
+        return False
+    return True
 
 
 def _limit() -> int | None:

@@ -133,7 +133,9 @@ class Scopes:
         than fit and residuals together."""
         standard, k = float(budget.magnitude.standard), float(budget.magnitude.coverage)
         crossed = c.residual.cross_validated_rms_g
-        pose = max(float(np.hypot(standard, c.residual.rms_g)), crossed or 0.0)
+        pose = float(np.hypot(standard, c.residual.rms_g))
+        if crossed is not None:
+            pose = max(pose, crossed)
         return cls(float(budget.magnitude.expanded), k * pose, following.expanded_uncertainty)
 
     @property
