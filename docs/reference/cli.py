@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 
 from triaxcald.cli.commands import parser
@@ -47,7 +48,7 @@ Poses are labelled by the side that is up: `+X`, `-X+Y` between two sides, `+X+Y
 
 Keys of documents keep their `_g` whatever the unit of the reference is. Errors are shown in µg if the unit is `g`, in a power of ten of another unit, or in ppm of an unnamed one. The default unit is `g` for a magnitude of 0.9 to 1.1, else `reference unit`.
 
-The commands that measure share these options:
+Several commands have these options:
 
 """  # noqa: E501
 NOTES = {
@@ -99,10 +100,25 @@ UNITS = """The columns of `--units`:
 
 def page() -> str:
     commands = dict(commands_of(parser()))
-    shared = {o: a.help for a in options(commands["poses"]) for o in a.option_strings}
+    shared = _shared(commands.values())
     tables = {o for g in commands["poses"]._action_groups if g.title == "tables" for o in names(g._group_actions)}
-    head = HEAD + _table(options(commands["poses"]))
+    head = HEAD + _table(list(shared.values()))
     return "\n".join([head, *(_section(name, p, shared, tables) for name, p in commands.items())])
+
+
+Key = tuple[tuple[str, ...], str | None, str]
+"""Names, help and default of an option."""
+
+
+def _key(a: argparse.Action) -> Key:
+    return tuple(a.option_strings), a.help, _default(a)
+
+
+def _shared(commands: Iterable[argparse.ArgumentParser]) -> dict[Key, argparse.Action]:
+    """The options that several commands have alike."""
+    every = [a for p in commands for a in options(p)]
+    count = Counter(map(_key, every))
+    return {_key(a): a for a in every if count[_key(a)] > 1 and a.help}
 
 
 def commands_of(top: argparse.ArgumentParser, prefix: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
@@ -122,11 +138,11 @@ def names(actions: list[argparse.Action]) -> list[str]:
     return [o for a in actions for o in a.option_strings]
 
 
-def _section(name: str, p: argparse.ArgumentParser, shared: dict[str, str | None], tables: set[str]) -> str:
+def _section(name: str, p: argparse.ArgumentParser, shared: Container[Key], tables: set[str]) -> str:
     all_ = options(p)
-    common = [a for a in all_ if a.option_strings[0] in shared and a.help == shared[a.option_strings[0]]]
+    common = [a for a in all_ if _key(a) in shared]
     own = [a for a in all_ if a not in common]
-    listed = [f"`{o}`" for o in names(common) if o not in tables]
+    listed = [f"`{', '.join(a.option_strings)}`" for a in common if a.option_strings[0] not in tables]
     of_tables = [f"`{o}`" for o in names(common) if o in tables]
     parts = [f"## triaxcal {name}\n", f"    triaxcal {name} {_usage(p)}".rstrip() + "\n"]
     parts += [f"{p.description}\n", f"{NOTES[name]}\n"]
