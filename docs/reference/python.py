@@ -37,14 +37,19 @@ def page() -> str:
 
 def _class(name: str, of: type[Any]) -> str:
     lines = [f"## tc.{name}\n", _text(of), ""]
+    seen: set[int] = set()  # an older name of a member is the same object
+    plain = []
     for key, member in vars(of).items():
-        if key.startswith("_") or not (inspect.isfunction(member) or isinstance(member, property | classmethod)):
-            continue
         function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
-        if isinstance(member, property):
-            lines.append(f"* `.{key}`: {' '.join(_text(function).split()) or '(see the class)'}")
-        else:
-            lines.append(f"* `{_signature(key, function)}`: {' '.join(_text(function).split())}")
+        if key.startswith("_") or not inspect.isfunction(function) or id(member) in seen:
+            continue
+        seen.add(id(member))
+        if not _text(function):
+            plain.append(f"`.{key}`")
+            continue
+        call = f".{key}" if isinstance(member, property) else _signature(key, function)
+        lines.append(f"* `{call}`: {' '.join(_text(function).split())}")
+    lines += [f"* {', '.join(plain)}"] if plain else []
     return "\n".join(lines) + "\n"
 
 
