@@ -87,15 +87,15 @@ class Poses(tuple[Pose, ...]):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The closed loop: ``before`` is the linear calibration, ``calibration``
-    the one to use, with the effects that were found; ``findings`` act for
-    certain, ``candidates`` more likely than not, and ``probabilities`` has that
-    of every effect that was looked for, None where it is not calibrated;
-    ``unexplained`` is what no effect describes, ``held_out`` the error in poses
-    that no fit saw, ``advice`` what to do, an action a line, ``notes`` what else
-    to know. ``call`` is whether the calibration can be used. ``traces`` are what
-    the poses show of each finding and each candidate, against what drives it;
-    `plot` draws them."""
+    """The linear calibration ``before``, and ``calibration``, the one to use, with
+    the effects that were found.
+
+    ``call`` is the verdict. ``findings`` act for certain, ``candidates`` more
+    likely than not; ``probabilities`` has every effect of the search, None if its
+    probability is not calibrated. ``unexplained`` is the unmodelled part,
+    ``held_out`` the error in poses that no fit saw, ``advice`` a list of actions,
+    ``notes`` further remarks. ``traces`` are the partial residuals of each finding
+    and each candidate, which `plot` draws."""
 
     before: Calibration
     calibration: Calibration
@@ -112,15 +112,14 @@ class Diagnosis:
     _lines: tuple[str, ...] = field(repr=False, default=())
 
     def summary(self) -> str:
-        """Whether it can be used, what acts, the error before and after, and
-        what to do, a line each."""
+        """The verdict, the cause, the error before and after, and the next
+        step, a line each."""
         return "\n".join(["Diagnosis", *(f"  {line}" for line in self._lines)])
 
     def plot(self) -> Figure:
-        """The trace picture: the partial residual of each finding and each
-        candidate against what drives it, with the fitted curve and its 95 %
-        band; of what has no name against the variables that tell most of it;
-        the residuals where nothing is found. Raises ModuleNotFoundError without
+        """The partial residual of each finding, each candidate and an unmodelled
+        part against its driving variable, with the fitted curve and its 95 % band; without
+        findings the residuals. Raises ModuleNotFoundError without
         matplotlib."""
         from triaxcal.pictures import traces_figure  # matplotlib, which nothing else needs
 
