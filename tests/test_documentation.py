@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import ctypes
 import json
 import os
@@ -23,6 +24,8 @@ import pytest
 from pydantic import BaseModel
 
 import triaxcal as tc
+from benchmarks.measured import by_group
+from benchmarks.session import LISTED_RUNS
 from triaxcal_drivers.catalogue import load_bundle
 from triaxcald.cli.commands import main, parser
 from triaxcald.documents import to_text
@@ -558,10 +561,21 @@ def test_every_key_of_a_file_is_in_its_table(page: str, model: type[BaseModel]) 
     assert {k for k in dotted_keys(model) if k not in groups} - {re.sub(r"\.NAME$", "", k) for k in named} == set()
 
 
-def test_the_table_of_measured_recordings_is_there() -> None:
-    text = (PROJECT / "docs/measured.md").read_text("utf-8")
-    rows = re.findall(r"^\| (\w+/\w+) \|", text, re.MULTILINE)
-    assert len(rows) == len(set(rows)) >= 28
+def test_the_tables_of_measured_recordings_are_those_of_the_results() -> None:
+    """Each page has what its benchmark makes of the stored rows."""
+
+    def rows(name: str) -> list[list[str]]:
+        with (PROJECT / "benchmarks/results" / name).open(encoding="utf-8", newline="") as file:
+            return list(csv.reader(file))
+
+    measured, session = rows("measured.csv"), rows("session.csv")
+    assert len({row[0] for row in measured[1:]}) == len(measured) - 1 >= 28
+    assert by_group(measured[1:]) in (PROJECT / "docs/measured.md").read_text("utf-8")
+    text = (PROJECT / "docs/session.md").read_text("utf-8")
+    listed = [row for row in session[1:] if row[0] == f"1 to {LISTED_RUNS}"]
+    assert len(listed) == 8
+    shown = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
+    assert [row for row in listed if row not in shown] == []
 
 
 README = (PROJECT / "README.md").read_text("utf-8")

@@ -87,15 +87,15 @@ class Poses(tuple[Pose, ...]):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The closed loop: ``before`` is the linear calibration, ``calibration``
-    the one to use, with the effects that were found; ``findings`` act for
-    certain, ``candidates`` more likely than not, and ``probabilities`` has that
-    of every effect that was looked for, None where it is not calibrated;
-    ``unexplained`` is what no effect describes, ``held_out`` the error in poses
-    that no fit saw, ``advice`` what to do, an action a line, ``notes`` what else
-    to know. ``call`` is whether the calibration can be used. ``traces`` are what
-    the poses show of each finding and each candidate, against what drives it;
-    `plot` draws them."""
+    """The linear calibration ``before``, and ``calibration``, the one to use, with
+    the effects that were found.
+
+    ``call`` is the verdict. ``findings`` act for certain, ``candidates`` more
+    likely than not; ``probabilities`` has every effect of the search, None if its
+    probability is not calibrated. ``unexplained`` is the unmodelled part,
+    ``held_out`` the error in poses that no fit saw, ``advice`` a list of actions,
+    ``notes`` further remarks. ``traces`` are the partial residuals of each finding
+    and each candidate, which `plot` draws."""
 
     before: Calibration
     calibration: Calibration
@@ -112,15 +112,14 @@ class Diagnosis:
     _lines: tuple[str, ...] = field(repr=False, default=())
 
     def summary(self) -> str:
-        """Whether it can be used, what acts, the error before and after, and
-        what to do, a line each."""
+        """The verdict, the cause, the error before and after, and the next
+        step, a line each."""
         return "\n".join(["Diagnosis", *(f"  {line}" for line in self._lines)])
 
     def plot(self) -> Figure:
-        """The trace picture: the partial residual of each finding and each
-        candidate against what drives it, with the fitted curve and its 95 %
-        band; of what has no name against the variables that tell most of it;
-        the residuals where nothing is found. Raises ModuleNotFoundError without
+        """The partial residual of each finding, each candidate and an unmodelled
+        part against its driving variable, with the fitted curve and its 95 % band; without
+        findings the residuals. Raises ModuleNotFoundError without
         matplotlib."""
         from triaxcal.pictures import traces_figure  # matplotlib, which nothing else needs
 
@@ -309,11 +308,11 @@ def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | 
     """The calibration with three biases anew, by still poses of a later
     recording: scale factors, misalignments and effects are kept.
 
-    ``poses`` from `find_poses`, or what that takes; of them the ``first`` so
-    many that are 45° apart (10° where there are fewer), or all. The uncertainty
-    is that of today: what the calibration says of itself, what changes from
-    recording to recording, and the poses. Raises Refused where these do not
-    determine three biases, or where what is kept no longer fits; InvalidData.
+    ``poses`` from `find_poses`, or what that takes; only the ``first`` so many
+    that are 45° apart (10° if there are fewer), or all. The uncertainty contains
+    that of the calibration, the change from recording to recording, and that of
+    the poses. Raises Refused if these do not determine three biases, or if the
+    kept parameters no longer fit; InvalidData.
     """
     if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
         raise InvalidData(f"first: expected a whole number of at least 1, not {first!r}")
@@ -327,17 +326,15 @@ def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | 
 
 
 def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
-    """Where to point the unit, in an order in which attitude and time tell
-    apart; the first pose comes once more at the end, so there is one more than
-    ``poses``. Raises InvalidData for fewer than 9."""
+    """Directions for the unit, in an order that separates attitude from time,
+    with the first pose again at the end. Raises InvalidData for fewer than 9."""
     return tuple(PlannedPose(label, (float(x), float(y), float(z))) for label, (x, y, z) in closed(directions(poses)))
 
 
 def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -> uncertainty.Budget:
-    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no
-    recording can tell, by default what the calibration was made with. Raises
-    InvalidData where the calibration is not of still poses, or was loaded: its
-    document holds the budget then."""
+    """The uncertainty budget by the GUM (JCGM 100). ``stated`` has values that no
+    recording shows, by default those of the calibration. Raises InvalidData
+    after `load` (the document has the budget) and without still poses."""
     stated = calibration.stated if stated is None else stated
     if not calibration.poses:
         raise InvalidData(

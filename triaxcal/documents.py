@@ -84,8 +84,7 @@ class Calibration:
 
     @property
     def stated(self) -> Stated | None:
-        """What was stated that no recording can tell; None of a calibration
-        that was loaded."""
+        """Stated values that no recording shows; None after `load`."""
         return self._stated
 
     @property
@@ -115,8 +114,7 @@ class Calibration:
 
     @property
     def matrix(self) -> Floats:
-        """A (3,3). Beside effects it is not a calibration without them: see
-        `linear_only`."""
+        """A (3,3). With effects it is no calibration alone: see `linear_only`."""
         return self._fitted.sensor.matrix
 
     @property
@@ -131,8 +129,8 @@ class Calibration:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """By parameter ("bias.x", "temperature_bias.x"), in its unit; NaN where
-        they are not known."""
+        """By parameter ("bias.x", "temperature_bias.x"), in its unit; NaN if
+        unknown."""
         return dict(zip(self._fitted.parameters, map(float, self._fitted.standard_errors), strict=True))
 
     @property
@@ -141,8 +139,7 @@ class Calibration:
 
     @property
     def poses(self) -> tuple[PoseResult, ...]:
-        """Those of the fit; none of a calibration that was loaded (`to_dict`
-        has them)."""
+        """The poses of the fit; none after `load` (`to_dict` has them)."""
         return self._fitted.poses
 
     @property
@@ -156,10 +153,10 @@ class Calibration:
 
     @property
     def expanded_uncertainty(self) -> dict[str, float]:
-        """Of |a|, 95 %, in the unit of the reference vector: `this_fit` of the
-        calibration by itself, `this_sessions_poses` of one more pose of its
-        recording, with its noise, `another_day` of the next recording, with how
-        the unit starts. Empty where there is no budget."""
+        """Expanded uncertainty of |a|, 95 %, in the unit of the reference vector:
+        `this_fit` of the calibration, `this_sessions_poses` of one more pose of
+        its recording, `another_day` of the next recording. Empty without a
+        budget."""
         known = calibration_part(self.to_dict(), where="document").get("expanded_uncertainty_g")
         return {k: float(v) for k, v in known.items() if v is not None} if isinstance(known, Mapping) else {}
 
@@ -170,8 +167,8 @@ class Calibration:
 
     @property
     def linear_only(self) -> Calibration:
-        """The linear calibration fitted by itself; this one where it has no
-        effects. Raises InvalidData where nobody fitted it."""
+        """The linear calibration fitted by itself; this one if it has no effects.
+        Raises InvalidData if the document lacks it."""
         if not self._fitted.sensor.effects:
             return self
         if self._fitted.linear_only is not None:
@@ -200,18 +197,16 @@ class Calibration:
         """Calibrated readings.
 
         ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux,
-        uy, uz: then a DataFrame of the same library with ax, ay, az, whose
-        other columns serve as channels; ``columns`` says how it calls them
-        where that is otherwise, as in `find_poses`. Where it has the times too,
-        rates and lags of channels are those of the rows. ``channels`` are named
-        as in ``channel_reference`` of the document (temp_c, temp_c.rate,
-        before_x, …), one number or (n,) each; one that an effect needs and that
-        is not given counts as at its reference, with a `MissingChannel`
-        warning. Effects of time hold at `holds_at`, or with ``own_recording``
-        at the times ``t`` (n,) from the first sample of the recording that was
-        fitted. ``uncertainty``: also the standard uncertainties that the
-        calibration gives them, in the same shape, without the noise of the
-        readings. Raises InvalidData; Refused where the model has no inverse.
+        uy, uz, whose other columns serve as channels (``columns`` as in
+        `find_poses`): then a DataFrame of the same library with ax, ay, az.
+        ``channels`` are named as in ``channel_reference`` of the document
+        (temp_c, temp_c.rate, before_x, …), one number or (n,) each; a missing
+        one counts as at its reference, with a `MissingChannel` warning. Effects
+        of time hold at `holds_at`, or with ``own_recording`` at the times ``t``
+        (n,) from the first sample of the fitted recording. ``uncertainty``:
+        also the standard uncertainties that the calibration leaves, in the same
+        shape, without the noise of the readings. Raises InvalidData; Refused if
+        the model has no inverse.
         """
         table = u if tables.is_table(u) else None
         if table is None and columns is not None:
@@ -247,15 +242,15 @@ class Calibration:
         return tables.like(table, out if errors is None else out | dict(zip(UNCERTAINTY, errors.T, strict=True)))
 
     def needs_recording(self) -> tuple[str, ...]:
-        """Rates and lags of channels that the effects need: what no single
-        reading shows, and a recording does."""
+        """Rates and lags of channels that the effects need, which only a
+        recording shows."""
         needs = dict.fromkeys(name for effect, _ in self._fitted.sensor.effects for name in effect.needs)
         return tuple(name for name in needs if followed(name))
 
     @property
     def duration_s(self) -> float:
-        """How long the poses were held of which it is, in the median: over such
-        a time rates of channels are taken."""
+        """Median duration of the poses of the fit, over which rates of channels
+        are taken."""
         durations = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
         return float(np.median(durations)) if durations else DURATION_S
 
@@ -361,9 +356,9 @@ class Calibration:
         return covariates
 
     def uncertainty_in(self, poses: Sequence[Pose]) -> Floats:
-        """(n,) standard uncertainty of |a| in poses of another recording that
-        the calibration leaves, without the noise of these poses. Raises
-        InvalidData where a channel that the effects need is missing."""
+        """(n,) standard uncertainty of |a| that the calibration leaves in poses
+        of another recording, without their noise. Raises InvalidData if a
+        channel that the effects need is missing."""
         c = self._fitted
         u = np.array([p.mean for p in poses])
         covariates = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
@@ -389,8 +384,8 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], *, where: str = "document") -> Calibration:
-        """Of a calibration, loop or certificate document, of 0.1 too. Raises
-        InvalidData, which begins with ``where``."""
+        """From a calibration, loop or certificate document. Raises InvalidData,
+        which begins with ``where``."""
         part = calibration_part(document, where=where)
         units = part.get("units")
         named = units if isinstance(units, Mapping) else {}
@@ -419,13 +414,13 @@ class Calibration:
 
     def summary(self) -> str:
         """A few lines: the coefficients with their standard errors, the
-        residual, and what speaks against it."""
+        residual, and the warnings."""
         return text.summary(self._fitted, self.output_unit, self.reference_unit, self.warnings)
 
     def plot(self) -> Figure:
-        """The residuals of the poses, and where these lie on the sphere: also
-        of a loaded document, which holds them. Raises InvalidData where there
-        are none; ModuleNotFoundError without matplotlib."""
+        """The residuals of the poses, in order and on the sphere, also after
+        `load`. Raises InvalidData if there are none; ModuleNotFoundError without
+        matplotlib."""
         from triaxcal.pictures import residuals_figure  # matplotlib, which nothing else needs
 
         return residuals_figure(calibration_part(self.to_dict(), where="document"))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 
 from triaxcald.cli.commands import parser
@@ -15,7 +16,7 @@ HEAD = """# Command line
     triaxcal COMMAND …
     triaxcal --version
 
-Results go to standard output; progress, warnings and errors go to standard error. With `--json` standard output holds one JSON document and nothing else ([Documents](certificate.md)). Work on recordings that takes longer than 3 s reports its progress. A closed standard stream counts as `/dev/null`. Made from the commands' own help (`triaxcal COMMAND --help`) by `docs/reference/cli.py`.
+Results go to standard output; progress, warnings and errors go to standard error. With `--json` standard output holds one JSON document and nothing else ([Documents](certificate.md)). Made from the commands' own help (`triaxcal COMMAND --help`) by `docs/reference/cli.py`.
 
 ## Exit codes
 
@@ -26,60 +27,60 @@ Results go to standard output; progress, warnings and errors go to standard erro
 | 2 | bad input or usage: one line with file, line, field and what was expected; nothing was written |
 | 3 | refused: the data or the device's registers cannot carry the answer, or calibration and device do not belong together; the line says which poses would help |
 | 4 | a device or bus failed, [another command](#one-command-at-a-device) works with it, or the port of `--metrics` is taken. The line says what a device holds whose registers were being written |
-| 5 | the disk failed, or memory ran out; the recording is sound up to the stated time. Also if standard output takes no more |
+| 5 | the disk failed or memory ran out; the recording is sound up to the stated time. Also if standard output takes no more |
 | 130 | interrupted; the old calibration is untouched or back, unless the line says otherwise |
 
 The worst code of several units counts, in the order 4, 130, 5, 3, 2, 1, 0.
 
-Ctrl-C, SIGTERM and SIGHUP interrupt every command with one line and no file left half-written. A signal that was ignored from the start (`nohup`) stays ignored. A `record` into a folder without a terminal takes SIGHUP as a request to [read its station file again](../how-to/run-as-a-service.md). Commands that work on a bus count the signals: the first and the second cancel the work, and the recording is finished or the old calibration restored. The third ends at once, with exit code 4 if registers were being written; the line names the command that settles the device. If Python does not return, a small process kills the command within two seconds (137 in a shell). [Why](../decisions/0036-stop-means-stop.md).
+Ctrl-C, SIGTERM and SIGHUP interrupt every command with one line and no file left half-written. A signal that was ignored from the start (`nohup`) stays ignored. `record` into a folder without a terminal takes SIGHUP as a request to [read its station file again](../how-to/run-as-a-service.md). On a bus the first and the second signal cancel the work, and the recording is finished or the old calibration restored. The third ends at once, with exit code 4 if registers were being written; the line names the command that settles the device. If Python does not return, a small process kills the command within two seconds (137 in a shell). [Why](../decisions/0036-stop-means-stop.md).
 
 ## One command at a device
 
-`run`, `record`, `provision`, `restore`, `registers` and `demo` lock the device, and on a serial line the whole port, against other commands on this machine. The second command ends with exit code 4:
-
-```text
-triaxcal: Modbus unit 1, TCP port 502, host 192.168.1.20 is in use by `triaxcal run station.toml`, pid 4711, since 2026-01-12 14:02:11 +0100
-```
-
-`record -o FOLDER` waits for such a unit instead. Other units of one gateway or bus may be worked with at the same time; listening to a bus and `sim` lock nothing. The lock ends with its process. Its files are in `/run/lock`, else in `/tmp`; `TRIAXCAL_LOCK_FOLDER` names another folder, the same for all commands, for containers and a read-only root. [Why](../decisions/0035-one-command-at-a-device.md).
+`run`, `record`, `provision`, `restore`, `registers` and `demo` lock the device, and on a serial line the whole port, against other commands on this machine. The second command ends with exit code 4 and names the first; `record -o FOLDER` waits instead. Other units of one gateway or bus stay free; listening to a bus and `sim` lock nothing. The lock ends with its process. Its files are in `/run/lock`, else in `/tmp`; `TRIAXCAL_LOCK_FOLDER` names another folder for all commands, as for containers and a read-only root. [Why](../decisions/0035-one-command-at-a-device.md).
 
 A result (`-o`, `--report`, the files of `run`) is written whole or not at all, and through no symbolic link (exit 2). Pipes, `/dev/null`, `/dev/stdout` and `/dev/fd/N` are written to as they are.
 
 ## Input
 
-`REC` is a recording (`.mcap`, or the manifest `.segments.json` of one in [segments](recording.md#segments)), or a [table](tables.md): text with separators, Parquet, or `-` for text on standard input. A table that can be read in two ways is an error that names the option to settle it. Input that is nested, long or packed beyond honest use is an error before it takes time or memory ([profile](profile.md#bounds), [recording](recording.md#bounds)). A JSON document has at most 4 MiB and 400,000 lists and objects, and each key once. A file of another kind is named by its content.
+`REC` is a recording (`.mcap`, or the manifest `.segments.json` of one in [segments](recording.md#segments)), or a [table](tables.md): text with separators, Parquet, or `-` for text on standard input. A table that can be read in two ways is an error that names the option to settle it. Input beyond honest use is an error before it takes time or memory ([profile](profile.md#bounds), [recording](recording.md#bounds)). A JSON document has at most 4 MiB and 400,000 lists and objects, and each key once.
 
 Poses are labelled by the side that is up: `+X`, `-X+Y` between two sides, `+X+Y+Z` a corner; `N1`, `N2` … are other directions of a plan. Up is the direction of the specific force at rest.
 
 Keys of documents keep their `_g` whatever the unit of the reference is. Errors are shown in µg if the unit is `g`, in a power of ten of another unit, or in ppm of an unnamed one. The default unit is `g` for a magnitude of 0.9 to 1.1, else `reference unit`.
 
-These options are shared by the commands that measure:
+Several commands have these options:
 
 """  # noqa: E501
 NOTES = {
     "demo": """Simulated time runs at up to twenty times real speed. Exit 1 also if the output after a loss of power is outside 50 µg. Document `triaxcal.demo/1`.""",  # noqa: E501
-    "run": """All units of a [station file](station.md) run at the same time. The guide is on standard error: `left: poses: 4 of 26; next: +X+Y+Z up`. A counted pose stays counted. Each unit gets a recording, a report, an [outcome](outcome.md) and, unless it failed, a certificate, named `UNIT-SERIAL-TIME`, in the station's folder. Registers are written only if the profile has one for each scale factor, misalignment and bias, the station allows it, and the result is within limits. A verification that is outside its limit or ends early restores the old calibration; without a limit, so does an output that is worse than before (exit 1). With `--rezero` the recording carries the calibration, so `audit` recomputes the result; a calibration that does not belong to the unit is refused before the first pose (exit 3). Document `triaxcal.run/1`.""",  # noqa: E501
-    "sim": """Serves the unit of a [device file](device.md). SIGTERM and SIGHUP end it with 0, Ctrl-C with 130. A unit on python-can's `virtual` bus is reached from its own process alone; take `udp_multicast` between processes.""",  # noqa: E501
-    "record": """Ends with 0 after `--seconds`, with 130 on a signal; either way the recording is finished. A unit or bus that is absent or lost is opened again with pauses of half a second to ten. The unit must have the same serial number and is asked again while it is recorded; if another unit answers, or two units send at one place, its recording ends (exit 4) and the records since the last confirmation are [unconfirmed](recording.md#unconfirmed-records). The events `interrupted` and `gap` say when, why and how many records were lost. A unit that ends does not stop the others. All frames of a [bus](station.md#buses-that-are-listened-to) are recorded.
+    "run": """All units of a [station file](station.md) run at the same time. The guide is on standard error: `left: poses: 4 of 26 directions; next: +X+Y+Z up`. It counts new directions, held for long enough; the verification counts every still pose. Each unit gets a recording, a report, an [outcome](outcome.md) and, unless it failed, a certificate, in the station's folder. Registers are written only if the profile has one for each scale factor, misalignment and bias, the station allows it, and the result is within limits. A verification that is outside its limit or ends early restores the old calibration; without a limit, so does an output that is worse than before (exit 1). `--rezero` refuses a calibration of another unit before the first pose (exit 3). Document `triaxcal.run/1`.""",  # noqa: E501
+    "sim": """DEVICE.toml is a [device file](device.md). SIGTERM and SIGHUP end it with 0, Ctrl-C with 130. Only its own process reaches a unit on python-can's `virtual` bus; take `udp_multicast` between processes.""",  # noqa: E501
+    "record": """Ends with 0 after `--seconds`, with 130 on a signal; either way the recording is finished. If another unit answers, or two units send at one place, the unit's recording ends (exit 4), and the records since the last confirmation are [unconfirmed](recording.md#unconfirmed-records). The events `interrupted` and `gap` say when, why and how many records were lost.
 
-With `--segment-size` (default 256M) or `--segment-time` (default 1h) the recording is in [segments](recording.md#segments); `--keep` and `--keep-free` imply it and never delete a segment that an outcome or a certificate names. `--metrics` serves `/metrics` for Prometheus, `/health` (503 while a unit is lost) and a page. [Run as a service](../how-to/run-as-a-service.md) has a unit for systemd.""",  # noqa: E501
+With `--segment-size` (default 256M) or `--segment-time` (default 1h) the recording is in [segments](recording.md#segments); `--keep` and `--keep-free` imply it. `--metrics` serves `/metrics` for Prometheus, `/health` (503 while a unit is lost) and a page. [Run as a service](../how-to/run-as-a-service.md).""",  # noqa: E501
     "poses": """Document `triaxcal.poses/1`. Poses that [cannot be trusted](../explanation/data-quality.md) are marked with the reason.""",  # noqa: E501
-    "fit": """Document `triaxcal.calibration/1`, with the [budget](../explanation/uncertainty.md) of its uncertainty. Only one of `--turning`, `--attitudes` and `--datasheet` may be given ([how](../how-to/other-methods.md)); with any there is no budget. `--passport` and `--passport-error` are other names of the datasheet's options. A declared `--attitude-error` (0 to 0.3) stays in force if the residuals contradict it; a warning says what they tell. Without `--thermal-sensitivity` the station's or the profile's counts, else the odds of a thermal effect of up to three times 500 µg/K and 300 ppm/K.""",  # noqa: E501
-    "diagnose": """Finds and corrects effects that the linear model lacks ([how](../explanation/diagnosis.md)). Document `triaxcal.loop/1`. Four lines at the console:
+    "fit": """Document `triaxcal.calibration/1`, with the [budget](../explanation/uncertainty.md) of its uncertainty. Only one of `--turning`, `--attitudes` and `--datasheet` may be given ([how](../how-to/other-methods.md)); with any there is no budget. A declared `--attitude-error` (0 to 0.3) stays in force if the residuals contradict it, with a warning. Without `--thermal-sensitivity` the station's or the profile's counts, else the odds of a thermal effect of up to three times 500 µg/K and 300 ppm/K.""",  # noqa: E501
+    "diagnose": """[How](../explanation/diagnosis.md). Document `triaxcal.loop/1`. Four lines at the console:
 
 | line | content |
 |---|---|
 | `verdict` | `usable`; `record more` if further poses are expected to tell what acts, a pose is an outlier, or more poses would improve the next recording; `investigate` if something unmodelled acts or one calibration does not hold in all poses |
 | `cause` | what acts, each with its probability |
-| `error` | the held-out error (with `--check`) and the cross-validated one, before and after; residuals in standard errors, χ² per degree of freedom; the plain residual; the expanded uncertainty of \\|a\\| of this fit, of one more pose, and on another day |
+| `error` | before and after: held-out (with `--check`), cross-validated, in standard errors, χ² per degree of freedom, plain; the expanded uncertainty of \\|a\\| of this fit, of one more pose, and on another day |
 | `next` | what to record next |
 
-Exit 0 whatever the verdict; `--limit` judges. Several recordings are of one unit in order of time, with one linear model and effects of time run by run ([how](../how-to/diagnose-several-recordings.md)); signs, references, output units and serial numbers must agree (exit 2), also of `--check`, which may not be among them. A warning says if a recording does not look like this unit: its error is above 5 % of the reference, or misalignment and ratios of scale factors of 12 poses or more are further off than noise, age and 20 K explain. Poses of `--check` have effects of time as at `--at`; a moment after the end brings a warning with its uncertainty. `--units` gives `triaxcal.agreement/1` and goes with neither `--check` nor `--report`. Its `--limit` judges every unit. `--verbose` shows where scale factor, misalignment and bias hold (`at temp_c = 25 °C`, `long after the start`). `empirical` is a smooth function of the direction, harmonics of degree 3 to 6. In several recordings `bias_drift`, `warm_up` and `bias_step` also come for some of them (`x_run2`). [All effects](effects.md).""",  # noqa: E501
+* Exit 0 whatever the verdict; `--limit` judges, with `--units` every unit.
+* Several recordings are of one unit in order of time ([how](../how-to/diagnose-several-recordings.md)). Signs, references, output units and serial numbers must agree (exit 2), also of `--check`, which may not be among them.
+* A warning says if a recording does not look like this unit: its error is above 5 % of the reference, or misalignment and ratios of scale factors of 12 poses or more differ by more than noise, age and 20 K explain.
+* Poses of `--check` have effects of time as at `--at`.
+* `--units` gives `triaxcal.agreement/1` and goes with neither `--check` nor `--report`.
+* `--verbose` shows where scale factor, misalignment and bias hold (`at temp_c = 25 °C`). `empirical` is a smooth function of the direction. A suffix as in `x_run2` names one of several recordings. [All effects](effects.md).
+""",  # noqa: E501
     "rezero": """[How](../how-to/use-a-calibration.md#the-next-day). Document `triaxcal.calibration/1` with [`rezero` and `origin`](certificate.md#biases-anew). Refused (exit 3): fewer than three distinct poses, poses that do not determine three biases, kept parameters that no longer fit, a constant output, a calibration of another unit, other signs, another reference or output unit. Distinct poses are 45° apart, or 10° if there are not so many.""",  # noqa: E501
-    "apply": """Writes the columns of the input (outputs as `ux,uy,uz`, times as `t_s`, all else as it stood), then `ax,ay,az`, effects included. A channel that an effect needs and REC lacks counts as at its reference, with a warning. [Use a calibration](../how-to/use-a-calibration.md) has the formulas.""",  # noqa: E501
+    "apply": """A missing channel counts as at its reference, with a warning. [How to](../how-to/use-a-calibration.md).""",  # noqa: E501
     "verify": """Document `triaxcal.verify/1`. Untrusted poses are marked and in no figure; without others it is refused (exit 3). Signs and reference are the calibration's, and other ones are an error (exit 2). A warning says if the recording does not look like this unit, as for `diagnose --check`.""",  # noqa: E501
-    "plan": """Document `triaxcal.plan/1`. Without REC: a plan in the order to take it, the uncertainty of its worst parameter, and the effects that it cannot show. With REC: the poses still worth adding, best first. `--poses` takes 9 to 1000 directions (200 with `--for`), 14 and 26 being those of a cube. `--for` chooses directions, and levels of channels, that tell the effects best; it is refused (exit 3) if no pose shows them. [How to](../how-to/plan-poses.md), [why](../explanation/plans.md).""",  # noqa: E501
-    "frame": """Document `triaxcal.frame/1`. Poses on the faces of a fixture, in two orientations half a turn apart; several REC are units on one fixture ([how](../how-to/put-units-in-one-frame.md), [why](../explanation/frames.md)). A disturbance of 1 s or more parts poses even if the reading is the same. `--faces` gives one side for each pose, each pose on a face, or each face; `+X@90` adds the heading in degrees from a mark on the table to the body's next axis (y for x, z for y, x for z), counter-clockwise from above. `--datum` takes outward normals: the primary face is true, the secondary true in one direction. Exit 1 if units disagree on the faces (p below 0.01); the document is written all the same. Refused (exit 3): faces on one axis only, no second orientation and no `--table-tilt`, units without common faces.""",  # noqa: E501
+    "plan": """Document `triaxcal.plan/1`. Without REC: a plan in the order to take it, the uncertainty of its worst parameter, and the effects that it cannot show. `--poses` takes 9 to 1000 directions (200 with `--for`), 14 and 26 being those of a cube. `--for` chooses directions, and levels of channels, that tell the effects best; it is refused (exit 3) if no pose shows them. [How to](../how-to/plan-poses.md), [why](../explanation/plans.md).""",  # noqa: E501
+    "frame": """Document `triaxcal.frame/1`. [How](../how-to/put-units-in-one-frame.md), [why](../explanation/frames.md). A disturbance of 1 s or more parts poses even if the reading is the same. In `--faces` the heading counts in degrees from a mark on the table to the body's next axis (y for x, z for y, x for z), counter-clockwise from above. `--datum` takes outward normals: the primary face is true, the secondary true in one direction. Exit 1 if units disagree on the faces (p below 0.01); the document is written all the same. Refused (exit 3): faces on one axis only, no second orientation and no `--table-tilt`, units without common faces.""",  # noqa: E501
     "provision": """[How, and what happens on failure](../how-to/provision-registers.md). Document `triaxcal.provisioning/1` with the [outcome](outcome.md). `--force` overrules [doubts about the old contents](../how-to/provision-registers.md#plausible-before-written). `--resume` takes the station alone.""",  # noqa: E501
     "restore": """The source is a recording (`registers-before.json`) or a journal; its registers go only to the unit with their serial number. Document `triaxcal.restoration/1` with `device_state`, `evidence`, `registers`, `error`, `outcome` and `outcome_file`.""",  # noqa: E501
     "registers": """Document `triaxcal.registers/1`.""",
@@ -87,8 +88,8 @@ Exit 0 whatever the verdict; `--limit` judges. Several recordings are of one uni
     "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. Document `triaxcal.audit/1`.""",  # noqa: E501
     "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501
-    "log export": """Every measuring command reads this format. A phase or stream without samples is an error (exit 2). The output must not exist.""",  # noqa: E501
-    "log import": """Also of a recording of [all frames of a bus](recording.md#all-frames-of-a-bus). A summary of dropped frames is on standard error. [How](../how-to/import-a-log.md). Document `triaxcal.import/1`.""",  # noqa: E501
+    "log export": """A phase or stream without samples is an error (exit 2). The output must not exist.""",
+    "log import": """LOG may be a recording of [all frames of a bus](recording.md#all-frames-of-a-bus). A summary of dropped frames is on standard error. [How](../how-to/import-a-log.md). Document `triaxcal.import/1`.""",  # noqa: E501
 }
 UNITS = """The columns of `--units`:
 
@@ -99,10 +100,25 @@ UNITS = """The columns of `--units`:
 
 def page() -> str:
     commands = dict(commands_of(parser()))
-    shared = {o: a.help for a in options(commands["poses"]) for o in a.option_strings}
+    shared = _shared(commands.values())
     tables = {o for g in commands["poses"]._action_groups if g.title == "tables" for o in names(g._group_actions)}
-    head = HEAD + _table(options(commands["poses"]))
+    head = HEAD + _table(list(shared.values()))
     return "\n".join([head, *(_section(name, p, shared, tables) for name, p in commands.items())])
+
+
+Key = tuple[tuple[str, ...], str | None, str]
+"""Names, help and default of an option."""
+
+
+def _key(a: argparse.Action) -> Key:
+    return tuple(a.option_strings), a.help, _default(a)
+
+
+def _shared(commands: Iterable[argparse.ArgumentParser]) -> dict[Key, argparse.Action]:
+    """The options that several commands have alike."""
+    every = [a for p in commands for a in options(p)]
+    count = Counter(map(_key, every))
+    return {_key(a): a for a in every if count[_key(a)] > 1 and a.help}
 
 
 def commands_of(top: argparse.ArgumentParser, prefix: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
@@ -122,18 +138,18 @@ def names(actions: list[argparse.Action]) -> list[str]:
     return [o for a in actions for o in a.option_strings]
 
 
-def _section(name: str, p: argparse.ArgumentParser, shared: dict[str, str | None], tables: set[str]) -> str:
+def _section(name: str, p: argparse.ArgumentParser, shared: Container[Key], tables: set[str]) -> str:
     all_ = options(p)
-    common = [a for a in all_ if a.option_strings[0] in shared and a.help == shared[a.option_strings[0]]]
+    common = [a for a in all_ if _key(a) in shared]
     own = [a for a in all_ if a not in common]
-    listed = [f"`{o}`" for o in names(common) if o not in tables]
+    listed = [f"`{', '.join(a.option_strings)}`" for a in common if a.option_strings[0] not in tables]
     of_tables = [f"`{o}`" for o in names(common) if o in tables]
     parts = [f"## triaxcal {name}\n", f"    triaxcal {name} {_usage(p)}".rstrip() + "\n"]
     parts += [f"{p.description}\n", f"{NOTES[name]}\n"]
     parts += [_table(own)] if own else []
     parts += [UNITS + "".join(f"| {_cell(k)} | {_cell(v)} |\n" for k, v in COLUMNS.items())] * (name == "diagnose")
-    parts += [f"Shared options: {', '.join(listed)}.\n"] if listed else []
-    parts += [f"[Tables](tables.md): {', '.join(of_tables)}.\n"] if of_tables else []
+    of_tables = [f"of [tables](tables.md) {', '.join(of_tables)}"] if of_tables else []
+    parts += [f"Also {', '.join(listed + of_tables)}.\n"] if listed or of_tables else []
     parts += [f"Example: `{p.epilog.removeprefix('example: ')}`\n"] if p.epilog else []
     return "\n".join(parts)
 

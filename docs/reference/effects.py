@@ -14,7 +14,7 @@ PAGE = Path(__file__).with_suffix(".md")
 NAME = "NAME"
 HEAD = """# Effects
 
-An effect adds e to the reading of an axis, in g: u = K (s + b + e), where s is the specific force along that axis, and q its coefficients. It may act on one axis alone or on two. A channel, a time or a temperature counts from its reference. Made from the effects themselves by `docs/reference/effects.py`. [Add an effect](../how-to/add-an-effect.md) says how to write one.
+An effect adds e to the reading of an axis, in g: u = K (s + b + e), where s is the specific force along that axis, and q its coefficients. A channel, a time or a temperature counts from its reference. Made from the effects by `docs/reference/effects.py`. [How to add an effect](../how-to/add-an-effect.md).
 
 | name | what it is | coefficients | formula | needs |
 |---|---|---|---|---|

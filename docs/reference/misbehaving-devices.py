@@ -8,10 +8,10 @@ from pathlib import Path
 PAGE = Path(__file__).with_suffix(".md")
 HEAD = """# Devices that misbehave
 
-Simulated devices on Modbus TCP, Modbus RTU and CANopen, which share no code with the drivers, are provisioned by `triaxcal provision`. Each has one habit of real devices and lines. The table says what the device starts with afterwards, by its memory cells, and how the command ends ([outcome](outcome.md)). The tests run every row. Made from `tests/devices/rows.py` by `docs/reference/misbehaving-devices.py`. `python -m benchmarks.faulty_devices` draws devices and lines with many faults at once.
+`triaxcal provision` calibrates simulated devices on Modbus TCP, Modbus RTU and CANopen that share no code with the drivers. Each device has one habit of real devices and lines. The table gives the calibration with which the device starts afterwards, by its memory cells, the [`device_state`](outcome.md) and the exit code. The tests run every case. Made from `tests/devices/rows.py` by `docs/reference/misbehaving-devices.py`. `python -m benchmarks.faulty_devices` draws devices and lines with many faults at once.
 
-| a device that … | starts with | `device_state` | exit code | and it says |
-|---|---|---|---|---|
+| starts with | `device_state` | exit | a device that … |
+|---|---|---|---|
 """  # noqa: E501
 
 
@@ -21,7 +21,12 @@ def page() -> str:
         from tests.devices.rows import ROWS
     finally:
         del sys.path[0]
-    rows = (f"| {r.does} | {r.holds} | `{r.state}` | {r.exit_code} | {r.says} |\n" for r in ROWS)
+    endings: dict[tuple[str, str, int], list[str]] = {}
+    for r in ROWS:
+        endings.setdefault((r.holds, str(r.state), r.exit_code), []).append(r.does)
+    rows = (
+        f"| {holds} | `{state}` | {code} | {';<br> '.join(does)} |\n" for (holds, state, code), does in endings.items()
+    )
     return HEAD + "".join(rows)
 
 

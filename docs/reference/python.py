@@ -13,17 +13,13 @@ FUNCTIONS = ("find_poses", "calibrate", "diagnose", "verify", "rezero", "plan", 
 CLASSES = ("Calibration", "Diagnosis", "Verification", "Poses", "Pose", "PlannedPose", "Stated")
 ERRORS = ("TriaxcalError", "InvalidData", "Refused", "MissingChannel", "TooShort")
 VALUES = ("Samples", "StillSpan", "Sensor", "Moment", "Stage", "local_gravity_g")
-CONSTANTS = {
-    "Floats": "The type of an array of floating-point numbers",
-    "Ints": "The type of an array of integers",
-    "HEIGHTS_M": "The lowest and the highest height that `local_gravity_g` takes, in metres",
-}
+CONSTANTS = ("Floats", "Ints", "HEIGHTS_M")
 ROOMS = tuple(name for name in tc.__all__ if inspect.ismodule(getattr(tc, name)))
 HEAD = """# Python
 
     import triaxcal as tc
 
-These names are public: what they take and give stays, and names and keyword arguments may be added. The daemon and the command line use the names of the last section too, which may change with a minor version; everything else may change at any time. Made from the docstrings by `docs/reference/python.py`. [Use a calibration](../how-to/use-a-calibration.md) has an example.
+These names are public: their arguments and results stay; names and keyword arguments may be added. The names of the last section may change with a minor version, all others at any time. Made from the docstrings by `docs/reference/python.py`. [Use a calibration](../how-to/use-a-calibration.md) has an example.
 
 `tc.__version__` is the version.
 """  # noqa: E501
@@ -34,27 +30,26 @@ def page() -> str:
     parts += [f"## tc.{name}\n\n{_call(name, getattr(tc, name))}\n\n{_text(getattr(tc, name))}\n" for name in FUNCTIONS]
     parts += [_class(name, getattr(tc, name)) for name in CLASSES]
     parts += ["## Errors\n", *(f"* `tc.{name}`: {' '.join(_text(getattr(tc, name)).split())}" for name in ERRORS), ""]
-    parts += ["## For programs built on triaxcal\n", *(_line(name, getattr(tc, name)) for name in (*VALUES, *ROOMS))]
-    parts += [*(f"* `tc.{name}`: {text}." for name, text in CONSTANTS.items()), ""]
+    names = ", ".join(f"`tc.{name}`" for name in (*VALUES, *ROOMS, *CONSTANTS))
+    parts += [f"## For programs built on triaxcal\n\n{names}: their docstrings describe them (`help(tc.poses)`).\n"]
     return "\n".join(parts)
-
-
-def _line(name: str, of: Any) -> str:
-    """The first sentence of its docstring."""
-    first = " ".join(_text(of).split()).partition(". ")[0].rstrip(".")
-    return f"* `tc.{name}`: {first}."
 
 
 def _class(name: str, of: type[Any]) -> str:
     lines = [f"## tc.{name}\n", _text(of), ""]
+    seen: set[int] = set()  # an older name of a member is the same object
+    plain = []
     for key, member in vars(of).items():
-        if key.startswith("_") or not (inspect.isfunction(member) or isinstance(member, property | classmethod)):
-            continue
         function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
-        if isinstance(member, property):
-            lines.append(f"* `.{key}`: {' '.join(_text(function).split()) or '(see the class)'}")
-        else:
-            lines.append(f"* `{_signature(key, function)}`: {' '.join(_text(function).split())}")
+        if key.startswith("_") or not inspect.isfunction(function) or id(member) in seen:
+            continue
+        seen.add(id(member))
+        if not _text(function):
+            plain.append(f"`.{key}`")
+            continue
+        call = f".{key}" if isinstance(member, property) else _signature(key, function)
+        lines.append(f"* `{call}`: {' '.join(_text(function).split())}")
+    lines += [f"* {', '.join(plain)}"] if plain else []
     return "\n".join(lines) + "\n"
 
 

@@ -110,29 +110,25 @@ class VibrationPart:
 @dataclass(frozen=True)
 class Pose:
     """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output
-    units.
+    units. ``t_s``, the middle of the span, ``start_s`` and ``end_s`` are in seconds
+    from the first sample.
 
     ``dof`` are the degrees of freedom of the covariance (along the measured vector,
-    for six poses or more), ``shared_dof`` those of the part that the covariances of
-    all poses share, infinite where there is none; ``noise_levels`` describe this part
-    in full, where all poses of a recording share it.
+    for six poses or more), ``shared_dof`` those of the part that all poses share,
+    infinite without one; ``noise_levels`` describe this part in full.
 
-    ``channels`` are means over the span; ``t_s`` is the middle of the span, like
-    ``start_s`` and ``end_s`` in seconds from the first sample. ``creep`` (3,) is the
-    change of the outputs along the span, output units, where it exceeds the noise,
-    else zero; ``slope`` (3,) is the same without that condition, and ``slope_error``
-    the standard error of its part along the measured vector, infinite where unknown.
-    ``rates`` are the channels' slopes in the middle of the span, per second,
-    ``bends`` their second derivatives, per second², from the span and half its length
-    on either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` their
-    standard errors from the residual scatter. ``before`` (3,) is the mean of the
-    previous pose, None in the first; ``scatter`` (3,) the variance of a sample inside
-    the span, output units squared. ``fault`` names a fault of its samples
-    (`triaxcal.poses.quality`), if any: no fit uses such a pose. ``shaken`` are
-    vibrating parts that its mean excludes. ``restless`` is the ratio of its scatter
-    to that of most poses where it is far larger, which its covariance allows for;
-    else 1. ``parted``: a move hidden by vibration lies between it and the previous
-    pose.
+    ``channels`` are means over the span, ``rates`` their slopes in its middle, per
+    second, ``bends`` their second derivatives, per second², from the span and half
+    its length on either side; ``channel_errors``, ``rate_errors`` and ``bend_errors``
+    are their standard errors. ``slope`` (3,) is the change of the outputs along the
+    span, output units, ``slope_error`` the standard error of its part along the
+    measured vector, infinite if unknown; ``creep`` (3,) is the slope if it exceeds
+    the noise, else zero. ``before`` (3,) is the mean of the previous pose, None in
+    the first; ``scatter`` (3,) the variance of a sample inside the span, output units
+    squared. ``fault`` names a fault of its samples (`triaxcal.poses.quality`): no fit
+    uses such a pose. ``shaken`` are vibrating parts that its mean excludes.
+    ``restless`` is the ratio of its scatter to that of most poses if far larger, else
+    1. ``parted``: a move hidden by vibration precedes it.
     """
 
     start_s: float

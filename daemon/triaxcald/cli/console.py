@@ -281,7 +281,7 @@ class Bars:
         # pose, and where to turn next.
         if not guide.hint.startswith("hold still"):
             hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
-            self._plain(unit, f"{what}: {guide.found} of {guide.wanted}{hint}")
+            self._plain(unit, f"{what}: {guide.found} of {guide.wanted} directions{hint}")
 
     def _show(self, unit: str, **values: Any) -> None:
         with suppress(OSError):  # the terminal has gone; the work goes on

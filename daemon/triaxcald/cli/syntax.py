@@ -319,8 +319,8 @@ def _line(commands: Any) -> None:
     p.add_argument("device", metavar="DEVICE.toml", type=Path)
     p = _command(
         commands, "record", "record:record_command", "record only",
-        "A unit that is not there, or is lost, is waited for; the gap is in the recording. Of the station's buses all "
-        "frames are recorded, for `log import`.",
+        "A unit that is absent or lost is waited for; the gap is in the recording. A bus of the station is recorded "
+        "with all its frames, for `log import`.",
         "record station.toml -o rec.mcap --seconds 120",
     )  # fmt: skip
     p.add_argument("station", metavar="STATION.toml", type=Path)
@@ -584,7 +584,7 @@ def _audits(commands: Any) -> None:
     add_json(p)
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
     parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
-    p = _command(parts, "info", "recordings:info_command", "what a recording holds", "", "log info rec.mcap")
+    p = _command(parts, "info", "recordings:info_command", "show the contents of a recording", "", "log info rec.mcap")
     p.add_argument("recording", metavar="REC", type=Path)
     add_json(p)
     p = _command(

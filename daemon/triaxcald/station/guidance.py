@@ -106,7 +106,7 @@ def guide(
     elif 0 < still_s < hold_s and not enough[-1]:
         hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
     elif due:
-        hint = f"next: {_nearest(targets, distinct[0])}once more, as at first"
+        hint = f"next: {_nearest(targets, distinct[0])}once more: the first pose again shows drift"
     elif missing:
         hint = f"next: {_said(missing[0], targets)}"
     else:

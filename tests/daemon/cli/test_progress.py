@@ -23,7 +23,7 @@ def test_a_log_gets_one_line_for_each_pose(capsys: pytest.CaptureFixture[str]) -
         for found, hint in hints:
             bars.poses("can", "calibration", Guide(found, 2, 0.0, hint))
     assert capsys.readouterr().err.splitlines() == [
-        "can: poses: 0 of 2; next: +X up",
-        "can: poses: 1 of 2; next: -Y+Z up",
-        "can: poses: 2 of 2",
+        "can: poses: 0 of 2 directions; next: +X up",
+        "can: poses: 1 of 2 directions; next: -Y+Z up",
+        "can: poses: 2 of 2 directions",
     ]

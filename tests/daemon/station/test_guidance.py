@@ -90,7 +90,7 @@ def test_the_first_pose_is_wanted_again_when_all_others_are_there_and_not_before
     assert (almost.found, almost.repeat_due, almost.missing) == (13, False, (LABELS[13],))
     due = _guide(taken, repeat=True)
     assert (due.found, due.repeat_due, due.complete) == (14, True, False)
-    assert due.hint == f"next: {LABELS[0]} up once more, as at first"
+    assert due.hint == f"next: {LABELS[0]} up once more: the first pose again shows drift"
     near = UP[0] + np.array([0, np.sin(np.radians(6)), 0])
     done = _guide([*taken, _pose(near, 100.0)], repeat=True)
     assert (done.repeat_due, done.complete, done.hint) == (False, True, "done")
@@ -101,7 +101,7 @@ def test_the_first_pose_is_wanted_again_when_all_others_are_there_and_not_before
 def test_the_pose_to_repeat_is_the_first_that_was_taken_in_whatever_order() -> None:
     other = [UP[3], *UP[:3], *UP[4:]]
     due = _guide([_pose(u, 5.0 * i) for i, u in enumerate(other)], repeat=True)
-    assert due.hint == f"next: {LABELS[3]} up once more, as at first"
+    assert due.hint == f"next: {LABELS[3]} up once more: the first pose again shows drift"
     assert _guide([_pose(u, 5.0 * i) for i, u in enumerate([*other, UP[3]])], repeat=True).complete
 
 
