@@ -147,10 +147,12 @@ async def _record(
 ) -> list[Kept]:
     from triaxcald.run.recording import Roster, State
     from triaxcald.service.supervisor import Supervisor
-    from triaxcald.station.coming_back import Patience
     from triaxcald.station.config import SerialsSeen
+    from triaxcald.station.reconnect import RetryPolicy
 
-    roster = Roster(a.seconds, Patience(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress))
+    roster = Roster(
+        a.seconds, RetryPolicy(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress)
+    )
     serials = SerialsSeen()
 
     def in_a_line() -> str:

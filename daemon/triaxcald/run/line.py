@@ -53,9 +53,9 @@ from triaxcald.run.together import side_by_side
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.software import software
 from triaxcald.station.collection import Collection, Progress
-from triaxcald.station.coming_back import AtWork, Patience, Streaming
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
+from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
@@ -106,12 +106,12 @@ class UnitRun(UnitSession):
         serials: SerialsSeen | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         force: str | None = None,
-        others: AtWork | None = None,
+        others: ActiveUnits | None = None,
         rezero: EarlierFile | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
         self.rezero = rezero
-        self.others, self.force = others or AtWork(1), force
+        self.others, self.force = others or ActiveUnits(1), force
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
         self._recording: Path | None = None
@@ -129,8 +129,8 @@ class UnitRun(UnitSession):
         the outcome."""
         ending: Ending | None = None
         try:
-            patience = Patience(others=self.others)
-            async with self.place.opened(patience, partial(self.waits, patience)) as device:
+            policy = RetryPolicy(others=self.others)
+            async with self.place.opened(policy, partial(self.waits, policy)) as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
@@ -304,11 +304,11 @@ class UnitRun(UnitSession):
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
         self._tumble = tumble
         self._confirmation = self.confirmation(device, identity, writer, tumble)
-        patience = Patience(plan.comes_back_s, others=self.others)
-        returning = self.returning(device, identity, patience, confirmation=self._confirmation)
+        policy = RetryPolicy(plan.comes_back_s, others=self.others)
+        reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
-            await self._collect(returning, writer, tumble, READINGS, wanted)
+            await self._collect(reconnecting, writer, tumble, READINGS, wanted)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
@@ -337,11 +337,11 @@ class UnitRun(UnitSession):
             fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
             plan = self.station.file.plan
             confirmation = self.confirmation(device, identity, writer, check)
-            patience = Patience(plan.comes_back_s, others=self.others)
-            returning = self.returning(device, identity, patience, confirmation=confirmation)
+            policy = RetryPolicy(plan.comes_back_s, others=self.others)
+            reconnecting = self.reconnecting(device, identity, policy, confirmation=confirmation)
             async with confirmation.phase():
                 await confirmation.ask()
-                await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
+                await self._collect(reconnecting, writer, check, CORRECTED, plan.check_poses, fitted)
 
         self._write_back = WriteBack(
             self.place,
@@ -405,7 +405,7 @@ class UnitRun(UnitSession):
             self.progress.stage(self.name, "check poses")
             check = Collection(VERIFICATION, self.place.bundle, self.place.address)
             confirmation = self.confirmation(device, identity, None, check)
-            there = self.returning(device, identity, Patience(most_s=0.0), confirmation=confirmation)
+            there = self.reconnecting(device, identity, RetryPolicy(most_s=0.0), confirmation=confirmation)
             wanted = self.station.file.plan.check_poses
             async with confirmation.phase():
                 await self._collect(there, None, check, CORRECTED, wanted)
@@ -432,7 +432,7 @@ async def run_station(
     When it is cancelled, every unit is, again each time, and put in order
     first; the outcomes then say 130.
     """
-    serials, others = SerialsSeen(), AtWork(len(station.places))
+    serials, others = SerialsSeen(), ActiveUnits(len(station.places))
     runs = [
         UnitRun(
             station, place, progress,

@@ -30,10 +30,10 @@ from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.software import versions
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress, Recorded
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station
-from triaxcald.station.listening import Listened, RawRecords, ReturningBus
+from triaxcald.station.listening import Listened, RawRecords, ReconnectingBus
 from triaxcald.station.lock import locked
+from triaxcald.station.reconnect import RetryPolicy
 from triaxcald.text import NOTHING_YET
 
 
@@ -154,7 +154,7 @@ class AtRecording(ABC):
         return {}
 
     @abstractmethod
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         """As `run`, but for what it raises."""
 
     def _result(self) -> Kept:
@@ -170,11 +170,11 @@ class AtRecording(ABC):
         that has been asked to end."""
         self._leaves = True
 
-    async def run(self, seconds: float | None, patience: Patience) -> Kept:
+    async def run(self, seconds: float | None, policy: RetryPolicy) -> Kept:
         """Until there are so many ``seconds``, for ever where None, or until it
         is given up. Raises nothing, not even when it is cancelled."""
         try:
-            await self._work(seconds, patience)
+            await self._work(seconds, policy)
         except (Exception, asyncio.CancelledError) as raised:  # noqa: BLE001 - the one place that supervises a recording
             e = self._cause(raised)
             if self._asked(e):
@@ -261,9 +261,9 @@ class Roster:
     it."""
 
     def __init__(
-        self, seconds: float | None, patience: Patience, ended: Callable[[Kept], None] = lambda _: None
+        self, seconds: float | None, policy: RetryPolicy, ended: Callable[[Kept], None] = lambda _: None
     ) -> None:
-        self._seconds, self._patience, self._ended = seconds, patience, ended
+        self._seconds, self._policy, self._ended = seconds, policy, ended
         self._work: dict[str, tuple[AtRecording, asyncio.Task[Kept]]] = {}
         self._changes = 0
         self._changed = asyncio.Event()
@@ -332,7 +332,7 @@ class Roster:
                 changed.cancel()
 
     async def _record(self, one: AtRecording) -> Kept:
-        kept = await one.run(self._seconds, self._patience)
+        kept = await one.run(self._seconds, self._policy)
         self._ended(kept)
         return kept
 
@@ -371,25 +371,25 @@ class BusRecording(AtRecording):
     def _seconds(self) -> float:
         return self._listened.seconds
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
-        is_lost = partial(self._is_lost, patience)
-        async with self._place.opened(patience, lambda trouble: is_lost(str(trouble))) as listener:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
+        is_lost = partial(self._is_lost, policy)
+        async with self._place.opened(policy, lambda trouble: is_lost(str(trouble))) as listener:
             self._path = self._path_of()
 
             async def record(writer: RecordingWriter) -> None:
                 self._progress.stage(self.name, "recording")
-                await self._listened.for_seconds(ReturningBus(listener, patience, is_lost), writer, seconds)
+                await self._listened.for_seconds(ReconnectingBus(listener, policy, is_lost), writer, seconds)
 
             make = partial(self._new_writer, self._path)
             await self._recorded_by(make, record, self._path if self._segments else None)
 
-    def _is_lost(self, patience: Patience, trouble: str | None) -> None:
+    def _is_lost(self, policy: RetryPolicy, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
         self._trouble = trouble
         if trouble is None:
             self._progress.stage(self.name, text.BUS_IS_BACK)
         else:
-            self._progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
+            self._progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
 
     def _new_writer(self, path: Path) -> RecordingWriter:
         """With the station file in it. Raises RecordingError."""
@@ -458,9 +458,9 @@ class UnitRecording(AtRecording):
     def _latest(self) -> dict[str, float]:
         return dict(self._recorded.latest)
 
-    def _waits(self, patience: Patience, trouble: Exception) -> None:
+    def _waits(self, policy: RetryPolicy, trouble: Exception) -> None:
         self._is_lost(str(trouble))
-        self._session.waits(patience, trouble)
+        self._session.waits(policy, trouble)
 
     def _is_lost(self, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
@@ -470,13 +470,13 @@ class UnitRecording(AtRecording):
         super().leave()
         self._session.leave()
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         session, found = self._session, list[IdentityRead]()
 
         async def identify(device: Device) -> None:
             found[:] = [await session.identify(device)]
 
-        async with session.place.opened(patience, partial(self._waits, patience), identify) as device:
+        async with session.place.opened(policy, partial(self._waits, policy), identify) as device:
             (identity,) = found
             self._identified(session, identity)
             self._path = self._path_of(identity)
@@ -484,10 +484,10 @@ class UnitRecording(AtRecording):
             async def record(writer: RecordingWriter) -> None:
                 session.progress.stage(session.name, "recording")
                 confirmation = session.confirmation(device, identity, writer, self._recorded)
-                returning = session.returning(device, identity, patience, self._is_lost, confirmation)
+                reconnecting = session.reconnecting(device, identity, policy, self._is_lost, confirmation)
                 try:
                     async with confirmation.phase():
-                        await self._recorded.for_seconds(returning, writer, seconds)
+                        await self._recorded.for_seconds(reconnecting, writer, seconds)
                 finally:
                     self._wrong, self._unconfirmed = confirmation.wrong, confirmation.unconfirmed
 

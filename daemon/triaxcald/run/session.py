@@ -21,9 +21,9 @@ from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_chann
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded
-from triaxcald.station.coming_back import HOLE_S, Patience, Returning, Streaming
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
+from triaxcald.station.reconnect import HOLE_S, ReconnectingDevice, RetryPolicy, Streaming
 
 
 @dataclass(frozen=True)
@@ -73,15 +73,15 @@ class UnitSession:
         """Its serial number may be that of another unit of the station."""
         self.serials.discard(self.name)
 
-    def waits(self, patience: Patience, trouble: Exception) -> None:
+    def waits(self, policy: RetryPolicy, trouble: Exception) -> None:
         """The unit is not there, for now."""
-        self.progress.lost(self.name, text.waited_for(str(trouble), endless=patience.endless))
+        self.progress.lost(self.name, text.waited_for(str(trouble), endless=policy.endless))
 
-    def returning(
+    def reconnecting(
         self,
         device: Device,
         identity: IdentityRead,
-        patience: Patience,
+        policy: RetryPolicy,
         lost: Callable[[str | None], None] = lambda _: None,
         confirmation: Confirmation | None = None,
     ) -> Streaming:
@@ -98,12 +98,12 @@ class UnitSession:
             if trouble is None:
                 self.progress.stage(self.name, text.IS_BACK)
             else:
-                self.progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
+                self.progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
 
         # A unit of which a sample is rare is not silent before its profile says so.
         hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)
-        returning = Returning(device, identify, patience, tell, hole_s=hole_s)
-        return returning if confirmation is None else confirmation.of(returning)
+        reconnecting = ReconnectingDevice(device, identify, policy, tell, hole_s=hole_s)
+        return reconnecting if confirmation is None else confirmation.of(reconnecting)
 
     def confirmation(
         self, device: Device, identity: IdentityRead, writer: RecordingWriter | None, recorded: Recorded
@@ -118,7 +118,7 @@ class UnitSession:
         """Raises WrongUnit, TwoAnswer."""
         expected, bundle = identity.serial or self.place.unit.serial, self.place.bundle
         link = RegisterLink(device, self.profile, name=self.place.device_name)
-        # Once, without the patience of the link: who waits for a unit asks again.
+        # Once, without the retries of the link: who waits for a unit asks again.
         await identified(link, bundle, expected, where=self.place.address, device=device)
 
     async def identify(self, device: Device) -> IdentityRead:

@@ -21,10 +21,10 @@ from triaxcald.decoded import DecodedStream
 from triaxcald.errors import NoPoses, RecordingError, TwoAnswer
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
+from triaxcald.station.reconnect import Streaming
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the

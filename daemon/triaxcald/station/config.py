@@ -28,7 +28,7 @@ from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml, validate
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
-from triaxcald.station.coming_back import Patience, claimed, until_open
+from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -229,17 +229,16 @@ class Place:
     @asynccontextmanager
     async def opened(
         self,
-        patience: Patience | None = None,
+        policy: RetryPolicy | None = None,
         tell: Callable[[Exception], None] = lambda _: None,
         identify: Callable[[Device], Awaitable[None]] | None = None,
     ) -> AsyncIterator[Device]:
-        """The device, open and nobody else's until the context ends. Raises
-        DeviceInUse; BusError, DeviceAbsent and what ``identify`` does, with
-        ``patience`` once that ends (``tell`` is told meanwhile), as that is for
-        DeviceInUse too.
+        """The device, open and claimed until the context ends.
 
-        Whoever closes it and opens it again in between, as a reset does, keeps
-        it.
+        Raises DeviceInUse, BusError, DeviceAbsent and the errors of ``identify``.
+        With ``policy`` these are retried first, DeviceInUse only if the policy says
+        so; ``tell`` receives each error meanwhile. The claim stays if the device is
+        closed and opened in between, as a reset does.
         """
         device = self.device()
 
@@ -248,9 +247,9 @@ class Place:
             if identify is not None:
                 await identify(device)
 
-        async with claimed(claim_of(self.bus), patience, tell):
+        async with claimed(claim_of(self.bus), policy, tell):
             try:
-                await (attempt() if patience is None else until_open(attempt, patience, tell))
+                await (attempt() if policy is None else until_open(attempt, policy, tell))
                 yield device
             finally:
                 with suppress(DriverError):

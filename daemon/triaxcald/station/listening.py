@@ -15,7 +15,7 @@ from triaxcal_drivers.host_clock import HOST, SteadyClock, slept_ns
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 from triaxcald.recording.schema import RawDigest
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Patience, until_open
+from triaxcald.station.reconnect import RetryPolicy, until_open
 
 if TYPE_CHECKING:
     from triaxcal_drivers.can.line import BusListener
@@ -106,7 +106,7 @@ IDENTIFIERS_MOST = 1 << 16
 of random identifiers is to take no memory."""
 
 
-class ReturningBus:
+class ReconnectingBus:
     """A bus whose frames go on after an interruption.
 
     Silence is no loss on it, as nobody has to send: what tells of a loss is
@@ -119,13 +119,13 @@ class ReturningBus:
     def __init__(
         self,
         listener: BusListener,
-        patience: Patience,
+        policy: RetryPolicy,
         tell: Callable[[str | None], None],
         *,
         now_ns: Callable[[], int] = HOST.now_ns,
         slept_ns: Callable[[], int] = slept_ns,
     ) -> None:
-        self._listener, self._patience, self._tell = listener, patience, tell
+        self._listener, self._policy, self._tell = listener, policy, tell
         self._now_ns, self._slept_ns = now_ns, slept_ns
         self._opened_ns = 0
 
@@ -133,7 +133,7 @@ class ReturningBus:
         """As the listener's own. A batch without records tells of an
         interruption by a gap that is not over, another one of its end; the
         first record after it carries RawFlag.LOST_BEFORE. Raises BusError once
-        patience ends."""
+        policy gives up."""
         heard_ns, asleep_ns, lost = self._now_ns(), self._slept_ns(), False
         while True:
             try:
@@ -154,7 +154,7 @@ class ReturningBus:
                 gap = Gap(heard_ns, None, str(e))
             yield RawBatch.of([]).after(gap)
             self._tell(gap.cause)
-            await until_open(self._again, self._patience, lambda trouble: self._tell(str(trouble)))
+            await until_open(self._again, self._policy, lambda trouble: self._tell(str(trouble)))
             heard_ns, asleep_ns, lost = self._opened_ns, self._slept_ns(), True
             yield RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
             self._tell(None)
@@ -182,7 +182,7 @@ class Listened(RawRecords):
         most."""
         return {"frames": self.frames, "identifiers": len(self._seen), "errors": self.errors}
 
-    async def for_seconds(self, bus: ReturningBus, writer: RecordingWriter, seconds: float | None) -> None:
+    async def for_seconds(self, bus: ReconnectingBus, writer: RecordingWriter, seconds: float | None) -> None:
         """Records for so many seconds of the host's time, whatever comes in
         them; for ever where None. Raises BusError once the bus is given up."""
         now_s = asyncio.get_running_loop().time

@@ -20,7 +20,7 @@ from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.provision.registers import Doubt, Snapshot, departure_g, doubt_of_departure
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import ABSENT, Exchanged, Streaming
+from triaxcald.station.reconnect import ABSENT, Exchanged, Streaming
 
 SAMPLES = 20
 """Their median is not moved by a knock, and at the slowest usual rate they take
