@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 import triaxcal as tc
-from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcal_drivers.stall_clock import StallTolerantTimer
 from triaxcal_drivers.two_senders import RECORDS
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
@@ -307,7 +307,7 @@ class _Watch:
 
     def __init__(self, decoded: DecodedStream, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
-        self._samples, self._looks = -1, Looks(0.0, 0.0)
+        self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
         self._before: Counter[str] = Counter()
 
     def look(self, device: Streaming) -> None:
@@ -315,9 +315,9 @@ class _Watch:
         long."""
         now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
-            self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
+            self._samples, self._timer = samples, StallTolerantTimer(now_s, SILENCE_SHARE * self._timeout_s)
             self._before = Counter(self._decoded.counts)
-        elif self._looks.look(now_s) > self._timeout_s:
-            self._samples, self._looks = -1, Looks(0.0, 0.0)
+        elif self._timer.update(now_s) > self._timeout_s:
+            self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
             what = text.no_sample(self._timeout_s, self._decoded.counts - self._before)
             device.complain(DeviceSilent(f"{self._stream}: {what}"))

@@ -10,12 +10,12 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, RawBatch, SampleBlock
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcal_drivers.stall_clock import StallTolerantClock
 from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.provision.registers import Doubt, Snapshot, departure_g, doubt_of_departure
@@ -46,8 +46,8 @@ async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[Sample
     decoders = {name: driver.decoder(bundle, name) for name in blocks}
     # So long even if one of the two never comes.
     limit_s = sampling.silence_timeout_s + 2 * SAMPLES / sampling.rate_hz
-    with closing(Attention(asyncio.get_running_loop())) as attention:
-        async with attention.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
+    with closing(StallTolerantClock(asyncio.get_running_loop())) as clock:
+        async with clock.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
             async for batch in stream:
                 for name, decoder in decoders.items():
                     blocks[name].append(decoder.feed(batch))
