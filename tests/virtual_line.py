@@ -18,7 +18,7 @@ import pytest
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
-from triaxcald.provision.access import Pace, RegisterLink
+from triaxcald.provision.access import Clock, RegisterLink
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run import line, session, write_back
 from triaxcald.simulation.bench import load_device, simulate
@@ -53,9 +53,9 @@ class VirtualDevice:
         return START_NS + round(self.time_base.now_s() * 1e9)
 
     @property
-    def pace(self) -> Pace:
+    def clock(self) -> Clock:
         """What a deadline goes by. A pause takes none of this time, since nothing is asked in it."""
-        return Pace(lambda _: asyncio.sleep(0), self.time_base.now_s)
+        return Clock(lambda _: asyncio.sleep(0), self.time_base.now_s)
 
     async def open(self) -> None:
         await self.time_base.advance(REQUEST_S)
@@ -127,7 +127,7 @@ class OnModbus(VirtualDevice):
 
 
 class _VirtualRun(line.UnitRun):
-    """By the unit's own clock, at the disk's pace."""
+    """By the unit's own clock, at the disk's speed."""
 
     def __init__(self, station: Any, place: Any, progress: Any, **more: Any) -> None:
         self._device = place.device()
@@ -140,7 +140,7 @@ class _VirtualRun(line.UnitRun):
 
 def _linked(device: VirtualDevice, *arguments: Any, **settings: Any) -> RegisterLink:
     """By the host's clock a store would stall while another unit's fit keeps this one from being asked."""
-    return RegisterLink(device, *arguments, **settings, pace=device.pace)
+    return RegisterLink(device, *arguments, **settings, clock=device.clock)
 
 
 @contextlib.contextmanager

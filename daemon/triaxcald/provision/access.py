@@ -1,5 +1,5 @@
-"""Register access with patience: requests that may be repeated are, a busy
-device is waited for, all is recorded."""
+"""Register access: repeats the requests that may be repeated, waits for a busy
+device, and records every request."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import DaemonError, TwoAnswer
 
-# How time passes while a device is written to, so that tests need not wait.
-
 
 @dataclass(frozen=True)
-class Pace:
-    """``sleep`` for so many seconds, ``clock_s`` monotonic."""
+class Clock:
+    """The clock of a register link: ``sleep`` takes seconds, ``now_s`` is monotonic
+    [s]. A test passes a virtual one."""
 
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
-    clock_s: Callable[[], float] = time.monotonic
+    now_s: Callable[[], float] = time.monotonic
 
 
-REAL_PACE = Pace()
+SYSTEM_CLOCK = Clock()
 
 
 T = TypeVar("T")
@@ -75,11 +74,11 @@ class RegisterLink:
         profile: Profile,
         record: Callable[[RegisterAccess], None] | None = None,
         *,
-        pace: Pace = REAL_PACE,
+        clock: Clock = SYSTEM_CLOCK,
         name: str = "",
     ) -> None:
         steps = (*profile.sequences.store, *profile.sequences.reset)
-        self.pace, self.name, self.profile = pace, name, profile
+        self.clock, self.name, self.profile = clock, name, profile
         self._device = device
         self._record = record or (lambda access: None)
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}
@@ -169,7 +168,7 @@ class RegisterLink:
             try:
                 answer = await request()
             except DeviceBusy as e:
-                failure, now_s = e, self.pace.clock_s()
+                failure, now_s = e, self.clock.now_s()
                 busy_since_s = now_s if busy_since_s is None else busy_since_s
                 patient = now_s - busy_since_s < BUSY_S
             except NO_CONTACT as e:
@@ -182,7 +181,7 @@ class RegisterLink:
                 self._tired.add(kind)
                 raise failure
             if isinstance(failure, DeviceBusy):
-                await self.pace.sleep(BUSY_PAUSE_S)
+                await self.clock.sleep(BUSY_PAUSE_S)
             elif not isinstance(failure, DeviceSilent):
                 await self.renew()
 

@@ -29,9 +29,9 @@ async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) 
     One that is busy, or refuses, has its supply.
     """
     register = probe(profile) or next(iter(profile.registers))
-    deadline_s, missed, answered = link.pace.clock_s() + patience_s, 0, False
+    deadline_s, missed, answered = link.clock.now_s() + patience_s, 0, False
     while missed < MISSED:
-        if link.pace.clock_s() >= deadline_s:
+        if link.clock.now_s() >= deadline_s:
             return False
         try:
             await link.read_once(register)
@@ -41,8 +41,8 @@ async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) 
         except NO_CONTACT:
             missed += answered
             await link.renew()
-        await link.pace.sleep(LOOK_S)
+        await link.clock.sleep(LOOK_S)
     with suppress(DriverError):
-        await reconnect(link, profile, max(deadline_s - link.pace.clock_s(), LOOK_S))
+        await reconnect(link, profile, max(deadline_s - link.clock.now_s(), LOOK_S))
         return True
     return False

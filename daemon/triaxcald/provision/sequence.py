@@ -44,7 +44,7 @@ async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Seq
                 restarts = isinstance(following, (WaitStep, ReconnectStep)) and label == "reset"
                 acknowledged &= await _written(link, bundle, step, open_ended=label == "store" or restarts)
             case WaitStep():
-                await link.pace.sleep(step.wait_s)
+                await link.clock.sleep(step.wait_s)
             case PollStep():
                 await _poll(link, bundle.profile, label, step)
             case ReconnectStep():
@@ -75,7 +75,7 @@ async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_
 
 
 async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollStep) -> None:
-    deadline_s = link.pace.clock_s() + step.timeout_s
+    deadline_s = link.clock.now_s() + step.timeout_s
     while True:
         try:
             held = profile.decode(step.poll, await link.read_once(step.poll))
@@ -88,9 +88,9 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
                 return
         except (*NO_CONTACT, RegisterRefused) as e:  # a device at work may be silent, or refuse for now
             late = e
-        if link.pace.clock_s() >= deadline_s:
+        if link.clock.now_s() >= deadline_s:
             raise late
-        await link.pace.sleep(POLL_S)
+        await link.clock.sleep(POLL_S)
 
 
 def _shown(value: float) -> str:
@@ -105,7 +105,7 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
     One that starts may refuse for a while. At the deadline raises DeviceAbsent,
     DeviceSilent, BusError, RegisterRefused.
     """
-    deadline_s = link.pace.clock_s() + (RECONNECT_S if timeout_s is None else timeout_s)
+    deadline_s = link.clock.now_s() + (RECONNECT_S if timeout_s is None else timeout_s)
     while True:
         await link.close()
         try:
@@ -114,9 +114,9 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
                 await link.read_once(register)
             return
         except (*NO_CONTACT, RegisterRefused):
-            if link.pace.clock_s() >= deadline_s:
+            if link.clock.now_s() >= deadline_s:
                 raise
-        await link.pace.sleep(RETRY_S)
+        await link.clock.sleep(RETRY_S)
 
 
 def probe(profile: Profile) -> str | None:

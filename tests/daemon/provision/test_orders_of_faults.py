@@ -47,7 +47,7 @@ class Run:
 
 def provisioning(device: ModelDevice, folder: Path, wanted: Mapping[str, bytes]) -> Provisioning:
     bundle = BUNDLES[device.kind]
-    link = RegisterLink(device, bundle.profile, pace=device.pace)
+    link = RegisterLink(device, bundle.profile, clock=device.clock)
     image = image_of(bundle.profile, wanted)
     return Provisioning(link, bundle, image, unit="u", folder=folder, expected_serial="0777", where="here", run="1")
 
