@@ -186,7 +186,7 @@ def registers_told(p: Provisioning) -> tc.interchange.Document:
     return {
         "differing": list(p.differing),
         "written": list(p.written),
-        "marked": list(p.link.marked),
+        "marked": list(p.link.probed),
         "stored": p.stored,
         "cut_short_before": p.carried,
         "undoing_failed": p.undoing_failed,

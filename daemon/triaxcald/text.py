@@ -206,7 +206,7 @@ def left(p: Provisioning, station: Path) -> str:
 def provisioned(p: Provisioning) -> str:
     """What was done, and what the device holds now."""
     if not p.written:
-        marked = ", ".join(dict.fromkeys(p.link.marked))
+        marked = ", ".join(dict.fromkeys(p.link.probed))
         wrote = (
             f"; only {marked} was written, to show a restart, and holds its value again"
             if marked

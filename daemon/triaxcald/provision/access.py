@@ -92,8 +92,9 @@ class RegisterLink:
         """Answers that came twice, byte for byte, since the last `listen`."""
         self.touched: set[str] = set()
         """Registers that somebody has tried to write."""
-        self.marked: list[str] = []
-        """Registers that got a mark, or their value back, for each such write."""
+        self.probed: list[str] = []
+        """Registers written by the restart check, one entry a write: a probe, or the
+        register's own value again."""
 
     async def open(self) -> None:
         try:

@@ -14,7 +14,7 @@ from triaxcal_drivers.registers import TYPES
 from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.sequence import probe
+from triaxcald.provision.sequence import contact_register
 
 
 class WrongUnit(ProvisionError):
@@ -119,7 +119,7 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
     """
     profile = bundle.profile
     readable = (name for name, register in profile.registers.items() if register.access != "wo")
-    name = probe(profile) or next(readable, None)
+    name = contact_register(profile) or next(readable, None)
     if name is None:
         return
     for _ in range(ASKED):

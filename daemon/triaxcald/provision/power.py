@@ -7,7 +7,7 @@ from contextlib import suppress
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
-from triaxcald.provision.sequence import probe, reconnect
+from triaxcald.provision.sequence import contact_register, reconnect
 
 LOOK_S = 0.2
 """So often the device is asked; a supply is off for longer when a person
@@ -28,7 +28,7 @@ async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) 
 
     One that is busy, or refuses, has its supply.
     """
-    register = probe(profile) or next(iter(profile.registers))
+    register = contact_register(profile) or next(iter(profile.registers))
     deadline_s, missed, answered = link.clock.now_s() + patience_s, 0, False
     while missed < MISSED:
         if link.clock.now_s() >= deadline_s:

@@ -17,8 +17,8 @@ from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of, was_cut_short
-from triaxcald.provision.proof import Restart, proven_restart
 from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, doubts, image_of, take_snapshot, unstable
+from triaxcald.provision.restart_check import Restart, checked_restart
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.software import new_run_id
@@ -45,7 +45,7 @@ async def restore(
     registers that differ are written, and stored if ``stored``. The store is
     also sent if no restart has shown what is stored: the registers in use may
     differ from it. Returns once every register reads back as the snapshot's raw
-    bytes; the evidence is a restart only if a mark was gone after it. Raises
+    bytes; the evidence is a restart only if a probe was gone after it. Raises
     ProvisionError that says why not; WrongUnit, with nothing written, if another
     unit answers.
     """
@@ -91,12 +91,12 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
 
 
 async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images) -> bool:
-    """Whether a mark shows that the device restarted."""
+    """Whether a probe shows that the device restarted."""
     if not bundle.profile.sequences.reset:
         return False
     await lock_quietly(link, bundle)
     try:
-        return (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
+        return (await checked_restart(link, bundle, snapshot.serial, *known)).probe_gone
     except WrongUnit:  # one of ProvisionError
         raise
     except (RegisterRefused, ProvisionError):
@@ -124,7 +124,7 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, kn
         return False
     restarted = False
     if bundle.profile.sequences.reset:
-        restarted = (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
+        restarted = (await checked_restart(link, bundle, snapshot.serial, *known)).probe_gone
     await _require_equal(link, bundle, snapshot)
     if not acknowledged and not restarted:
         raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")
@@ -185,7 +185,7 @@ class Provisioning:
     """What is in use is the image, and the provisioning that was cut short may
     not have stored it."""
     _restarted: bool = False
-    """Whether a mark was gone before the registers were read at first."""
+    """Whether a probe was gone before the registers were read at first."""
     _journaled: bool = False
     _earlier: list[Journal] = field(default_factory=list)
     """Journals of this unit that earlier provisionings left, the newest first."""
@@ -245,12 +245,12 @@ class Provisioning:
             await self.look()
         journals = self._journals
         if restart and self.restart_owed:
-            if not journals:  # `write` shows a restart with a mark, once the doubts are answered
+            if not journals:  # `write` shows a restart with a probe, once the doubts are answered
                 await self._sequence("reset")
             else:
                 self.steps.append("reset")
                 known = [image for _, entry in journals for image in (entry.before, entry.wanted)]
-                self._restarted = (await self._restart(*known)).mark_gone
+                self._restarted = (await self._restart(*known)).probe_gone
             self.found = await self._read("reading the stored calibration")
             self.restart_owed = False
             self._compare()
@@ -474,7 +474,7 @@ class Provisioning:
                 await self._decide(Evidence.READ_BACK)  # it may have dropped the registers when it was locked
             if self.held.state is not DeviceState.NEW_VERIFIED:
                 await self._prove_by_power_cycle()
-        except TwoAnswer:  # a mark may be in use, and a restart may have changed what is
+        except TwoAnswer:  # a probe may be in use, and a restart may have changed what is
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
             raise
         if self.held.state is DeviceState.UNKNOWN:
@@ -500,7 +500,7 @@ class Provisioning:
             self._decided = False  # a value that nobody wants is in use
             raise
         self.steps.append("identity after the reset")
-        await self._decide(Evidence.RESTART if restart.mark_gone else Evidence.READ_BACK)
+        await self._decide(Evidence.RESTART if restart.probe_gone else Evidence.READ_BACK)
 
     async def _decide(self, evidence: Evidence) -> None:
         """State what the device holds, by reading it. Raises ProvisionError if
@@ -605,7 +605,7 @@ class Provisioning:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
+        restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).probe_gone
         held = self.after = await self._look()
         state = self._state_of(held)
         if not restarted and state is DeviceState.OLD and lasting:
@@ -629,8 +629,8 @@ class Provisioning:
         return await run_sequence(self.link, self.bundle, label)
 
     async def _restart(self, *known: Mapping[str, bytes]) -> Restart:
-        restart = await proven_restart(self.link, self.bundle, self.identity.serial, *known)
-        if restart.mark_gone:
+        restart = await checked_restart(self.link, self.bundle, self.identity.serial, *known)
+        if restart.probe_gone:
             self.held.saw(Observation.MARK_GONE)
         return restart
 

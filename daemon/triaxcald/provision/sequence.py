@@ -110,7 +110,7 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
         await link.close()
         try:
             await link.open()
-            if register := probe(profile):
+            if register := contact_register(profile):
                 await link.read_once(register)
             return
         except (*NO_CONTACT, RegisterRefused):
@@ -119,7 +119,7 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
         await link.clock.sleep(RETRY_S)
 
 
-def probe(profile: Profile) -> str | None:
+def contact_register(profile: Profile) -> str | None:
     """A register by which a device shows that it is there: opening may succeed
     on the bus alone."""
     return profile.identity.serial_register or next(iter(profile.identity.expect), None)

@@ -16,7 +16,7 @@ class DeviceState(StrEnum):
     OLD = "old"
     """Something was written, and the old calibration is back."""
     NEW_VERIFIED = "new_verified"
-    """All registers read back equal after a restart that took a mark away, or
+    """All registers read back equal after a restart that removed a probe, or
     after the supply was seen off."""
     NEW_UNVERIFIED = "new_unverified"
     """The store was acknowledged and the registers read back equal; no restart
@@ -52,7 +52,7 @@ class Evidence(StrEnum):
     READ_BACK = "read_back"
     """The registers read back equal, with no restart since they were written."""
     RESTART = "read_after_restart"
-    """All registers were read after a restart that took a mark away."""
+    """All registers were read after a restart that removed a probe."""
     POWER_CYCLE = "read_after_power_cycle"
     """All registers were read after the supply was seen off."""
     WRITE_COUNTER = "write_counter"

@@ -154,7 +154,7 @@ class Unit:
             raise Silent
         if "forgotten" not in self.habits:
             self.eeprom = dict(self.ram)
-        if fault == "flipped":  # the bit by which the first mark differs
+        if fault == "flipped":  # the bit by which the first probe differs
             self.eeprom["bias_x"] = bytes([self.ram["bias_x"][0], self.ram["bias_x"][1] ^ 1])
 
 
