@@ -13,7 +13,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Held
 
 if TYPE_CHECKING:
     from triaxcald.provision.procedure import Provisioning
-    from triaxcald.provision.registers import Doubt
+    from triaxcald.provision.registers import SanityWarning
 
 _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
     (DeviceState.UNTOUCHED, None): "no register was written",
@@ -278,7 +278,7 @@ def _checked(verification: Mapping[str, Any]) -> str:
     return f"{tc.number_format.micro_g(verification['after_rms_g'])}{told} off"
 
 
-def doubt(of: Doubt) -> str:
+def sanity_warning(of: SanityWarning) -> str:
     match of.kind:
         case "not_a_number":
             return f"{of.register} holds no number"
@@ -294,14 +294,15 @@ def doubt(of: Doubt) -> str:
             return f"{of.register} holds {of.value:.6g}, expected {of.low:g} to {of.high:g}"
 
 
-MOST_DOUBTS = 3
-"""So many are listed: what makes one register absurd makes most of them so."""
+MOST_WARNINGS = 3
+"""Number of warnings listed: one cause, such as a wrong word order, affects most
+registers."""
 
 
-def doubted(of: Sequence[Doubt]) -> str:
-    """Why nothing is written."""
-    listed = "; ".join(doubt(d) for d in of[:MOST_DOUBTS])
-    more = f"; and {len(of) - MOST_DOUBTS} more" if len(of) > MOST_DOUBTS else ""
+def refused_by_sanity_warnings(of: Sequence[SanityWarning]) -> str:
+    """Refusal to write because of sanity warnings."""
+    listed = "; ".join(sanity_warning(w) for w in of[:MOST_WARNINGS])
+    more = f"; and {len(of) - MOST_WARNINGS} more" if len(of) > MOST_WARNINGS else ""
     return (
         f"what the device holds is no calibration under its profile (word order, scaling, addresses?): {listed}{more}; "
         "nothing was written; --force REASON writes all the same"

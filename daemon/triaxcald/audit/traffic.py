@@ -16,7 +16,7 @@ from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
 from triaxcald.provision.identity import serial_text
 from triaxcald.provision.power import MISSED
-from triaxcald.provision.registers import RegisterImage, calibration_registers, doubts
+from triaxcald.provision.registers import RegisterImage, calibration_registers, sanity_warnings
 from triaxcald.provision.restart_check import SEQUENCES, may_probe, own_steps, writes_of
 from triaxcald.provision.sequence import Label
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -271,7 +271,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
         if said.image and said.earlier is None and not said.forced:
             found += [
                 Difference(ATTACHMENT, Kind.NOT_FORCED, doubt.register)
-                for doubt in doubts(traffic.profile, snapshot.Snapshot(said.before), said.image)
+                for doubt in sanity_warnings(traffic.profile, snapshot.Snapshot(said.before), said.image)
             ]
         if not said.aborted:
             expect("written", list(written), differing)

@@ -362,7 +362,7 @@ def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
     return out
 
 
-def doubts_of_one_unit(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
+def unit_identity_warnings(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
     """Lines where several recordings can hardly be of one unit; ``loop`` is
     that of all of them."""
     if len(recordings) == 1:
@@ -379,7 +379,7 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, 
     ]
 
 
-def doubts_of_check(measured: Measured, check: Measured, loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
+def check_identity_warnings(measured: Measured, check: Measured, loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
     """A line where the held-out poses can hardly be of the unit of those
     diagnosed in ``loop``."""
     assert loop.held_out is not None
@@ -523,10 +523,10 @@ def diagnose_command(a: argparse.Namespace) -> int:
     check = measured_check(measured, a)
     choice = chosen(a, measured)
     loop = _loop(a, measured, choice, check.poses if check else None)
-    remarks, doubts = channels_of_some(recordings), doubts_of_one_unit(recordings, loop, choice)
+    remarks, doubts = channels_of_some(recordings), unit_identity_warnings(recordings, loop, choice)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
-        doubts += doubts_of_check(measured, check, loop, choice)
+        doubts += check_identity_warnings(measured, check, loop, choice)
     progress(tc.Stage.ADVICE)
     document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:

@@ -10,10 +10,10 @@ from typing import Any
 import triaxcal as tc
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
+from triaxcald.caveats import is_passing
 from triaxcald.certificate import held_by_device, image_of, why_not_written
 from triaxcald.cli.console import emit, say, show, showing, table
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.doubts import is_passing
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
@@ -95,8 +95,8 @@ def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> N
         columns.remove("after")
     rows = [[word[column] for column in columns] for word in _words(p)]
     table(f"unit {place.unit.name}, serial {p.identity.serial}", columns, rows)
-    for doubt in p.doubts:
-        say(f"warning: {text.doubt(doubt)}")
+    for warning in p.warnings:
+        say(f"warning: {text.sanity_warning(warning)}")
     show(done.document["reason"])
     if settling := text.settling(p, station):
         show(settling)

@@ -7,9 +7,9 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 import triaxcal as tc
+from triaxcald.caveats import assumption
 from triaxcald.cli.console import show, table
 from triaxcald.cli.showing import Choice, counted
-from triaxcald.doubts import assumption
 
 WIDTH = 80
 WORTH_A_LINE = 0.01

@@ -17,7 +17,15 @@ from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of, was_cut_short
-from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, doubts, image_of, take_snapshot, unstable
+from triaxcald.provision.registers import (
+    RegisterImage,
+    SanityWarning,
+    Snapshot,
+    image_of,
+    sanity_warnings,
+    take_snapshot,
+    unstable,
+)
 from triaxcald.provision.restart_check import Restart, checked_restart
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -170,7 +178,7 @@ class Provisioning:
     """Has the supply switched off and on, where nothing else shows what is
     stored; whether that was seen."""
     held: Held = field(default_factory=Held)
-    doubts: list[Doubt] = field(default_factory=list)
+    warnings: list[SanityWarning] = field(default_factory=list)
     differing: tuple[str, ...] = ()
     written: list[str] = field(default_factory=list)
     steps: list[str] = field(default_factory=list)
@@ -245,7 +253,7 @@ class Provisioning:
             await self.look()
         journals = self._journals
         if restart and self.restart_owed:
-            if not journals:  # `write` shows a restart with a probe, once the doubts are answered
+            if not journals:  # `write` shows a restart with a probe, once the warnings are answered
                 await self._sequence("reset")
             else:
                 self.steps.append("reset")
@@ -264,7 +272,7 @@ class Provisioning:
             self.held.now(DeviceState.UNTOUCHED, Evidence.NOTHING_WRITTEN)
             again = await self._read("reading the old calibration again")
             profile = self.bundle.profile
-            self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
+            self.warnings = unstable(profile, self.found, again) or sanity_warnings(profile, self.found, self.image)
 
     async def look(self) -> None:
         """Who is there, and what its registers hold. Nothing is written, and the

@@ -94,7 +94,7 @@ class Outcome:
 
 class UnitRun(UnitSession):
     """The whole line for one unit of a station. ``force`` is the reason to
-    write in spite of doubts, ``others`` the units at work beside it. ``rezero``
+    write in spite of warnings, ``others`` the units at work beside it. ``rezero``
     is the calibration of which the biases alone are renewed."""
 
     def __init__(
@@ -222,7 +222,7 @@ class UnitRun(UnitSession):
             software=software(),
             supersedes=latest_of(self.station.folder, self._serial),
             journal=self._journal,
-            forced=self.force if back and back.doubts else None,
+            forced=self.force if back and back.warnings else None,
         )
 
     @property

@@ -32,14 +32,21 @@ from triaxcald.outcome import (
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.journal import journaled_image, open_journal, parse, registers_of
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, image_of, leaves_open, require_readings_before
+from triaxcald.provision.registers import (
+    RegisterImage,
+    SanityWarning,
+    Snapshot,
+    image_of,
+    leaves_open,
+    require_readings_before,
+)
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 from triaxcald.software import software
 from triaxcald.station.config import Place, Station
-from triaxcald.station.output_check import doubts_of_live_output
+from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
 
 
@@ -59,7 +66,7 @@ class Provisioned:
 class ProvisionRun:
     """Writes ``image``, meant for the unit ``serial``, to the device at
     ``place``; without an image, the one of a provisioning that was cut short.
-    ``force`` is the reason to write in spite of doubts."""
+    ``force`` is the reason to write in spite of warnings."""
 
     station: Station
     place: Place
@@ -72,7 +79,7 @@ class ProvisionRun:
     and on where nothing else shows what is stored."""
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
-    doubts: Sequence[Doubt] = field(default=(), init=False)
+    warnings: Sequence[SanityWarning] = field(default=(), init=False)
     _begun: Provisioning | None = field(default=None, init=False)
 
     async def run(self) -> Provisioned:
@@ -117,11 +124,11 @@ class ProvisionRun:
             require_readings_before(bundle.profile, p.found)
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
-        self.doubts = p.doubts
-        if not p.carried and p.differing and not self.doubts:
-            self.doubts = await doubts_of_live_output(device, bundle, p.found)
-        if self.doubts and self.force is None and not self.dry_run:
-            raise Implausible(text.doubted(self.doubts))
+        self.warnings = p.warnings
+        if not p.carried and p.differing and not self.warnings:
+            self.warnings = await live_output_warnings(device, bundle, p.found)
+        if self.warnings and self.force is None and not self.dry_run:
+            raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         if not self.dry_run:
             with p.finishing():
                 await p.write()
@@ -189,7 +196,7 @@ class ProvisionRun:
             software=software(),
             supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
             journal=str(self._open_journal) if self._open_journal else None,
-            forced=self.force if self.doubts else None,
+            forced=self.force if self.warnings else None,
         )
 
     def _write(self, document: tc.interchange.Document) -> Path:

@@ -23,10 +23,10 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import (
     LEAST,
-    Doubt,
     RegisterImage,
+    SanityWarning,
     departure_g,
-    doubt_of_departure,
+    departure_warnings,
     is_blank,
     require_readings_before,
 )
@@ -59,7 +59,7 @@ an undoing brings back."""
 @dataclass
 class WriteBack:
     """``collect`` fetches check poses, ``ask`` shows the operator what to do;
-    ``force`` is the reason to go on in spite of `doubts`. ``verdict`` is the
+    ``force`` is the reason to go on in spite of `warnings`. ``verdict`` is the
     one on the device's own output, None before it is judged."""
 
     place: Place
@@ -71,7 +71,7 @@ class WriteBack:
     force: str | None = None
     verification: tc.interchange.Document | None = field(default=None, init=False)
     verdict: str | None = field(default=None, init=False)
-    doubts: Sequence[Doubt] = field(default=(), init=False)
+    warnings: Sequence[SanityWarning] = field(default=(), init=False)
     provisioning: Provisioning | None = field(default=None, init=False)
 
     async def examine(
@@ -95,9 +95,9 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
-        self.doubts = [*p.doubts, *self._doubts_of_output(tumble)]
-        if self.doubts and self.force is None:
-            raise Implausible(text.doubted(self.doubts))
+        self.warnings = [*p.warnings, *self._output_warnings(tumble)]
+        if self.warnings and self.force is None:
+            raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         self._attach(REGISTERS_BEFORE, p.found.raw)
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
@@ -133,7 +133,7 @@ class WriteBack:
             if (task := asyncio.current_task()) and task.cancelling():
                 raise asyncio.CancelledError
 
-    def _doubts_of_output(self, tumble: Collection) -> list[Doubt]:
+    def _output_warnings(self, tumble: Collection) -> list[SanityWarning]:
         assert self.provisioning is not None
         if CORRECTED not in tumble.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
             return []
@@ -144,7 +144,7 @@ class WriteBack:
             for pairs in _alignments(readings, outputs)
             if (off_g := departure_g(profile, found, *_paired(pairs))) is not None
         ]
-        return doubt_of_departure(min(departures, default=None))
+        return departure_warnings(min(departures, default=None))
 
     async def _verify(self, tumble: Collection) -> str:
         """What the device's own output is judged to be."""

@@ -18,7 +18,7 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcal_drivers.stall_clock import StallTolerantClock
 from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
-from triaxcald.provision.registers import Doubt, Snapshot, departure_g, doubt_of_departure
+from triaxcald.provision.registers import SanityWarning, Snapshot, departure_g, departure_warnings
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.reconnect import ABSENT, Exchanged, Streaming
 
@@ -27,7 +27,7 @@ SAMPLES = 20
 two seconds."""
 
 
-async def doubts_of_live_output(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[Doubt]:
+async def live_output_warnings(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[SanityWarning]:
     """None where the device has no corrected output, or where it does not come."""
     if CORRECTED not in bundle.profile.streams:
         return []
@@ -38,7 +38,7 @@ async def doubts_of_live_output(device: Device, bundle: Bundle, snapshot: Snapsh
     _, mine, theirs = np.intersect1d(readings[0], outputs[0], return_indices=True)
     channels = {name: values[mine] for name, values in readings[2].items()}
     off_g = departure_g(bundle.profile, snapshot, readings[1][mine], outputs[1][theirs], channels)
-    return doubt_of_departure(off_g)
+    return departure_warnings(off_g)
 
 
 async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[SampleBlock]]) -> None:
