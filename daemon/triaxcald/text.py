@@ -174,14 +174,14 @@ def held(of: Held) -> str:
     return _HELD.get((of.state, of.evidence)) or _HELD[of.state, None]
 
 
-def settling(p: Provisioning, station: Path) -> str:
-    """The command that clears up what the device holds; empty where nothing is
-    left to be cleared up."""
-    return "" if p.settled else to_settle(p.held, p.open_journal, p.unit, station)
+def recovery_command(p: Provisioning, station: Path) -> str:
+    """The command that settles the state of the device; empty if it is settled."""
+    return "" if p.settled else _command_to_settle(p.held, p.open_journal, p.unit, station)
 
 
-def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
-    """The same, by the journal where there is one."""
+def _command_to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
+    """The command for a device in the state ``of``, with the journal if there is
+    one."""
     provision = f"triaxcal provision {'--resume' if journal else 'CAL.json'} {station} --unit {unit}"
     restore = f"triaxcal restore {journal or 'REC'} {station} --unit {unit}"
     told = f" (journal: {journal})" if journal else ""
@@ -193,14 +193,16 @@ def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
 
 
 def unfinished(journal: Path, unit: str, station: Path) -> str:
-    """Of a device that this run has not examined."""
+    """Notice about a journal whose device this run has not examined."""
     unknown = Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-    return f"an earlier provisioning was cut short or not verified; {to_settle(unknown, journal, unit, station)}"
+    return (
+        f"an earlier provisioning was cut short or not verified; {_command_to_settle(unknown, journal, unit, station)}"
+    )
 
 
-def left(p: Provisioning, station: Path) -> str:
-    """What the device holds, and the command that clears it up."""
-    return "; ".join(filter(None, (held(p.held), settling(p, station))))
+def abort_notice(p: Provisioning, station: Path) -> str:
+    """State of the device, and the recovery command."""
+    return "; ".join(filter(None, (held(p.held), recovery_command(p, station))))
 
 
 def provisioned(p: Provisioning) -> str:

@@ -48,7 +48,7 @@ def _told(done: Provisioned, station: Path) -> str:
     p = done.provisioning
     if p is None or done.error is not None:
         return ""
-    return "; ".join(filter(None, [done.document["reason"], text.settling(p, station)]))
+    return "; ".join(filter(None, [done.document["reason"], text.recovery_command(p, station)]))
 
 
 def _ask(what: str) -> None:
@@ -98,8 +98,8 @@ def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> N
     for warning in p.warnings:
         say(f"warning: {text.sanity_warning(warning)}")
     show(done.document["reason"])
-    if settling := text.settling(p, station):
-        show(settling)
+    if recovery_command := text.recovery_command(p, station):
+        show(recovery_command)
     if done.path is not None:
         show(f"outcome {done.path}")
 

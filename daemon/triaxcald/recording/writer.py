@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
-from triaxcald.abort import Left, add_action, discard_action
+from triaxcald.abort import AbortNotice, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.files import require_new
 from triaxcald.memory import ran_out_of_memory
@@ -233,15 +233,15 @@ class RecordingWriter:
         if self._failure is not None:
             raise self._failure
 
-    def _finish_at_abort(self, until_s: float) -> Left | None:
+    def _finish_at_abort(self, until_s: float) -> AbortNotice | None:
         self._closed = True
         self._jobs.put(None)
         self._thread.join(max(0.0, until_s - time.monotonic()))
         if self._provisional:
             return None
         if self._thread.is_alive():
-            return Left(f"{self._told} is not finished; triaxcal log recover mends it")
-        return Left(str(self._failure) if self._failure else f"{self._told} is finished")
+            return AbortNotice(f"{self._told} is not finished; triaxcal log recover mends it")
+        return AbortNotice(str(self._failure) if self._failure else f"{self._told} is finished")
 
     def __enter__(self) -> Self:
         return self

@@ -16,7 +16,7 @@ from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
-from triaxcald.abort import Left, at_abort
+from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.documents import to_text
 from triaxcald.errors import BAD_INPUT, Implausible, InputError, RecordingError
 from triaxcald.files import write_new
@@ -87,7 +87,7 @@ class ProvisionRun:
         the outcome."""
         ending: Ending | None = None
         try:
-            with at_abort(self.left):
+            with at_abort(self.abort_notice):
                 async with self.place.opened() as device:
                     await self._work(device)
                     ending = Ending.of(Code.NOT_CHECKED, self._done())
@@ -108,10 +108,14 @@ class ProvisionRun:
                 document = self._document(ending)
         return Provisioned(ending.exit_code, document, self.provisioning, self._error(ending), path)
 
-    def left(self, _: float) -> Left | None:
+    def abort_notice(self, _: float) -> AbortNotice | None:
         """What the end at once would leave behind."""
         p = self._begun
-        return Left(text.left(p, self.station.path), not p.settled) if p is not None and p.examined else None
+        return (
+            AbortNotice(text.abort_notice(p, self.station.path), not p.settled)
+            if p is not None and p.examined
+            else None
+        )
 
     async def _work(self, device: Device) -> None:
         bundle = self.place.bundle
@@ -211,7 +215,7 @@ class ProvisionRun:
         told = [ending.reason]
         p = self._begun
         if p is not None and (p.examined or p.open_journal):
-            told.append(text.left(p, self.station.path))
+            told.append(text.abort_notice(p, self.station.path))
         elif self._open_journal:
             told.append(text.unfinished(self._open_journal, self.place.unit.name, self.station.path))
         return "; ".join(filter(None, told))
