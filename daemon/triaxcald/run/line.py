@@ -119,7 +119,7 @@ class UnitRun(UnitSession):
         self._recording: Path | None = None
         self._artifacts: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
-        self._tumble: Collection | None = None
+        self._acquisition: Collection | None = None
         self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
@@ -281,8 +281,8 @@ class UnitRun(UnitSession):
             error=error,
             wanted=ending.wanted,
             lost=self._lost,
-            data_quality=tuple(self._tumble.pipelines[READINGS].data_quality())
-            if self._tumble and ending.exit_code == REFUSED
+            data_quality=tuple(self._acquisition.pipelines[READINGS].data_quality())
+            if self._acquisition and ending.exit_code == REFUSED
             else (),
         )
 
@@ -308,26 +308,26 @@ class UnitRun(UnitSession):
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
-        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
-        self._tumble = tumble
-        self._confirmation = self.confirmation(device, identity, writer, tumble)
+        acquisition = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
+        self._acquisition = acquisition
+        self._confirmation = self.confirmation(device, identity, writer, acquisition)
         policy = RetryPolicy(plan.comes_back_s, others=self.others)
         reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
-            await self._collect(reconnecting, writer, tumble, READINGS, wanted)
+            await self._collect(reconnecting, writer, acquisition, READINGS, wanted)
         self.progress.stage(self.name, "fitting")
-        poses = tumble.pipelines[READINGS].finish()
-        certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
+        poses = acquisition.pipelines[READINGS].finish()
+        certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
-            await self._write(device, writer, certified.image, identity, tumble)
+            await self._write(device, writer, certified.image, identity, acquisition)
         ending = judged(
             certified.document,
             self._write_back.verification if self._write_back else None,
             self.station.file.limits,
         )
         self.progress.stage(self.name, "writing the report")
-        artifacts = {REPORT: await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS], ending)}
+        artifacts = {REPORT: await asyncio.to_thread(self._report, certified, acquisition.pipelines[READINGS], ending)}
         if ending.verdict is not Verdict.FAIL:
             artifacts[CERTIFICATE] = to_text(certified.document)
         for name, media_type in ((REPORT, "text/html"), (CERTIFICATE, "application/json")):
@@ -337,11 +337,16 @@ class UnitRun(UnitSession):
         return ending
 
     async def _write(
-        self, device: Device, writer: RecordingWriter, image: RegisterImage, identity: IdentityRead, tumble: Collection
+        self,
+        device: Device,
+        writer: RecordingWriter,
+        image: RegisterImage,
+        identity: IdentityRead,
+        acquisition: Collection,
     ) -> None:
         async def collect(check: Collection) -> None:
             self.progress.stage(self.name, "verifying by physics")
-            fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
+            fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
             plan = self.station.file.plan
             confirmation = self.confirmation(device, identity, writer, check)
             policy = RetryPolicy(plan.comes_back_s, others=self.others)
@@ -362,17 +367,17 @@ class UnitRun(UnitSession):
         assert self._confirmation is not None
         async with self._confirmation.phase():  # the unit may have been silent when the poses ended
             self.progress.stage(self.name, "writing the registers")
-            examined = await self._write_back.examine(device, image, identity.serial, tumble)
-        await self._write_back.write(examined, tumble)
+            examined = await self._write_back.examine(device, image, identity.serial, acquisition)
+        await self._write_back.write(examined, acquisition)
 
-    def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
+    def _certify(self, acquisition: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
             self.place.bundle,
             self.station.file,
             self.station.text,
-            tumble.pipelines[READINGS],
+            acquisition.pipelines[READINGS],
             poses,
-            tumble.digest,
+            acquisition.digest,
             unit_name=self.name,
             serial=identity.serial,
             signs=self.place.signs,

@@ -75,7 +75,7 @@ class WriteBack:
     provisioning: Provisioning | None = field(default=None, init=False)
 
     async def examine(
-        self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection
+        self, device: Device, image: RegisterImage, serial: str | None, acquisition: Collection
     ) -> Provisioning:
         """Identifies the unit and reads its registers; nothing is written.
         Raises Implausible, Refused, ProvisionError, StationError, DiskError."""
@@ -95,7 +95,7 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
-        self.warnings = [*p.warnings, *self._output_warnings(tumble)]
+        self.warnings = [*p.warnings, *self._output_warnings(acquisition)]
         if self.warnings and self.force is None:
             raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         self._attach(REGISTERS_BEFORE, p.found.raw)
@@ -103,19 +103,19 @@ class WriteBack:
             self._attach(REGISTERS_EARLIER, p.before.raw)
         return p
 
-    async def write(self, p: Provisioning, tumble: Collection) -> None:
+    async def write(self, p: Provisioning, acquisition: Collection) -> None:
         """Whatever is raised on the way, the old calibration has been put back
         before, or `held` says what is not. Raises ProvisionError, StationError,
         DiskError."""
         with p.finishing():
             await p.write()
-            await self._finish(p, tumble)
+            await self._finish(p, acquisition)
 
-    async def _finish(self, p: Provisioning, tumble: Collection) -> None:
+    async def _finish(self, p: Provisioning, acquisition: Collection) -> None:
         try:
             self._attach(REGISTERS_AFTER, p.after.raw)
             self.writer.event("provisioned", {"written": list(p.written)})
-            self.verdict = await self._verify(tumble)
+            self.verdict = await self._verify(acquisition)
         except (DiskError, WrongUnit, TwoAnswer):  # said as they are
             await p.undo()
             raise
@@ -133,12 +133,12 @@ class WriteBack:
             if (task := asyncio.current_task()) and task.cancelling():
                 raise asyncio.CancelledError
 
-    def _output_warnings(self, tumble: Collection) -> list[SanityWarning]:
+    def _output_warnings(self, acquisition: Collection) -> list[SanityWarning]:
         assert self.provisioning is not None
-        if CORRECTED not in tumble.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
+        if CORRECTED not in acquisition.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
             return []
         profile, found = self.place.bundle.profile, self.provisioning.found
-        readings, outputs = tumble.pipelines[READINGS].poses(), tumble.pipelines[CORRECTED].poses()
+        readings, outputs = acquisition.pipelines[READINGS].poses(), acquisition.pipelines[CORRECTED].poses()
         departures = [
             off_g
             for pairs in _alignments(readings, outputs)
@@ -146,16 +146,16 @@ class WriteBack:
         ]
         return departure_warnings(min(departures, default=None))
 
-    async def _verify(self, tumble: Collection) -> str:
+    async def _verify(self, acquisition: Collection) -> str:
         """What the device's own output is judged to be."""
         if CORRECTED not in self.place.bundle.profile.streams:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
         found, reference = corrected(check, self.station.file.reference), self.station.file.reference
-        fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
+        fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
         document = self.verification = verification_document(
-            corrected(tumble, reference),
+            corrected(acquisition, reference),
             found,
             limit_g=self.station.file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),

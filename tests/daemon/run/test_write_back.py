@@ -16,7 +16,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
 from triaxcald.errors import DiskError, ProvisionError, RecordingError, StationError
-from triaxcald.inputs import CALIBRATION as TUMBLE
+from triaxcald.inputs import CALIBRATION
 from triaxcald.provision.procedure import restore
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.provision.state import DeviceState, Evidence
@@ -81,8 +81,8 @@ class Bench:
         return WriteBack(self.place, self.station, self.writer, collect, ask=self.asked.append, started="today")
 
     async def run(self, back: WriteBack) -> None:
-        tumble = Collection(TUMBLE, self.place.bundle, self.place.address)
-        await back.write(await back.examine(self.device, self.image, "4711", tumble), tumble)
+        acquisition = Collection(CALIBRATION, self.place.bundle, self.place.address)
+        await back.write(await back.examine(self.device, self.image, "4711", acquisition), acquisition)
 
 
 def _state(back: WriteBack) -> DeviceState:
