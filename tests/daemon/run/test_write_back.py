@@ -16,7 +16,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
 from triaxcald.errors import DiskError, ProvisionError, RecordingError, StationError
-from triaxcald.inputs import CALIBRATION
+from triaxcald.inputs import CALIBRATION as CALIBRATION_POSES
 from triaxcald.provision.procedure import restore
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.provision.state import DeviceState, Evidence
@@ -81,7 +81,7 @@ class Bench:
         return WriteBack(self.place, self.station, self.writer, collect, ask=self.asked.append, started="today")
 
     async def run(self, back: WriteBack) -> None:
-        acquisition = Collection(CALIBRATION, self.place.bundle, self.place.address)
+        acquisition = Collection(CALIBRATION_POSES, self.place.bundle, self.place.address)
         await back.write(await back.examine(self.device, self.image, "4711", acquisition), acquisition)
 
 
