@@ -1,8 +1,8 @@
-"""The MCAP file as a row of records, each with its offset, checked so strictly
-that damage cannot pass.
+"""The records of an MCAP file with their offsets, checked strictly enough to detect
+all damage.
 
-The library's own readers give no offsets, do not check attachments, and trust
-the lengths they read.
+The library's own readers give no offsets, do not check attachments, and trust the
+lengths that they read.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class CutShort(Damage):
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One record of the file: ``body`` is what follows its opcode and length."""
+class UnparsedRecord:
+    """One MCAP record, not yet parsed: ``body`` follows its opcode and length."""
 
     offset: int
     opcode: int
@@ -129,7 +129,7 @@ def written_to(stream: BinaryIO, size: int) -> int:
     return 0
 
 
-def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
+def unparsed_at(stream: BinaryIO, name: str, offset: int, size: int) -> UnparsedRecord:
     """The record at ``offset`` of a file of ``size`` bytes. Raises CutShort,
     Damage."""
     stream.seek(offset)
@@ -144,22 +144,22 @@ def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
     limit = _LIMITS.get(opcode, RECORD_LIMIT)
     if length > limit:
         raise Damage(name, offset, f"{_kind(opcode)} record of {length} bytes, expected at most {limit},")
-    return Frame(offset, opcode, stream.read(length))
+    return UnparsedRecord(offset, opcode, stream.read(length))
 
 
 def _kind(opcode: int) -> str:
     return Opcode(opcode).name.lower().replace("_", " ")
 
 
-def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
+def walk(stream: BinaryIO, name: str, size: int) -> Iterator[UnparsedRecord]:
     """All records in order, from the header to the footer. Raises CutShort,
     Damage."""
     offset = len(MAGIC)
     while True:
-        frame = frame_at(stream, name, offset, size)
-        yield frame
-        offset = frame.end
-        if frame.opcode == Opcode.FOOTER:
+        unparsed = unparsed_at(stream, name, offset, size)
+        yield unparsed
+        offset = unparsed.end
+        if unparsed.opcode == Opcode.FOOTER:
             return
 
 
@@ -188,32 +188,32 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 }
 
 
-def parse(frame: Frame, name: str) -> McapRecord:
-    """The record in ``frame``, which must be as long as it says; chunks are for
+def parse(unparsed: UnparsedRecord, name: str) -> McapRecord:
+    """The record in ``unparsed``, which must be as long as it says; chunks are for
     `chunk_data`. Raises Damage."""
-    kind = _kind(frame.opcode)
-    read = _READERS.get(frame.opcode)
+    kind = _kind(unparsed.opcode)
+    read = _READERS.get(unparsed.opcode)
     if read is None:
-        raise Damage(name, frame.offset, f"a {kind} record out of place")
-    stream = ReadDataStream(io.BytesIO(frame.body))
+        raise Damage(name, unparsed.offset, f"a {kind} record out of place")
+    stream = ReadDataStream(io.BytesIO(unparsed.body))
     try:
         record = read(stream)
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as e:
-        raise Damage(name, frame.offset, f"unreadable {kind} record") from e
-    if stream.count != len(frame.body):
-        raise Damage(name, frame.offset, f"{kind} record of the wrong length")
+        raise Damage(name, unparsed.offset, f"unreadable {kind} record") from e
+    if stream.count != len(unparsed.body):
+        raise Damage(name, unparsed.offset, f"{kind} record of the wrong length")
     if isinstance(record, Attachment):
-        (crc,) = struct.unpack("<I", frame.body[-4:])
-        if crc not in (0, zlib.crc32(memoryview(frame.body)[:-4])):
-            raise Damage(name, frame.offset, f"attachment '{record.name}' fails its CRC")
+        (crc,) = struct.unpack("<I", unparsed.body[-4:])
+        if crc not in (0, zlib.crc32(memoryview(unparsed.body)[:-4])):
+            raise Damage(name, unparsed.offset, f"attachment '{record.name}' fails its CRC")
     return record
 
 
-def footer_fits(frame: Frame, crc: int) -> bool:
+def footer_fits(unparsed: UnparsedRecord, crc: int) -> bool:
     """Whether the footer's CRC is that of the summary before it, whose running
     CRC is ``crc``."""
-    (expected,) = struct.unpack("<I", frame.body[-4:])
-    return expected in (0, zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc)))
+    (expected,) = struct.unpack("<I", unparsed.body[-4:])
+    return expected in (0, zlib.crc32(unparsed.body[:-4], zlib.crc32(unparsed.head, crc)))
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
@@ -233,25 +233,25 @@ def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
     return Chunk(compression, data, end, start, crc, uncompressed_size), length
 
 
-def whole_chunk_head(frame: Frame, name: str) -> Chunk:
-    """The chunk in ``frame``, still compressed. Raises Damage where its lengths
+def whole_chunk_head(unparsed: UnparsedRecord, name: str) -> Chunk:
+    """The chunk in ``unparsed``, still compressed. Raises Damage where its lengths
     do not agree."""
-    found = chunk_head(frame.body)
+    found = chunk_head(unparsed.body)
     if found is None:
-        raise Damage(name, frame.offset, "unreadable chunk (expected zstd or no compression)")
+        raise Damage(name, unparsed.offset, "unreadable chunk (expected zstd or no compression)")
     chunk, length = found
     size = _CHUNK_HEAD.size + 4 + len(chunk.compression) + 8 + length
-    if size != len(frame.body):
-        raise Damage(name, frame.offset, "chunk of the wrong length")
+    if size != len(unparsed.body):
+        raise Damage(name, unparsed.offset, "chunk of the wrong length")
     return chunk
 
 
-def chunk_data(frame: Frame, name: str) -> bytes:
+def chunk_data(unparsed: UnparsedRecord, name: str) -> bytes:
     """The records inside the chunk, decompressed, their CRC checked. Raises
     Damage."""
-    data = unpack(whole_chunk_head(frame, name))
+    data = unpack(whole_chunk_head(unparsed, name))
     if data is None:
-        raise Damage(name, frame.offset, "a chunk fails its CRC")
+        raise Damage(name, unparsed.offset, "a chunk fails its CRC")
     return data
 
 
@@ -260,7 +260,7 @@ def unpack(chunk: Chunk) -> bytes | None:
     data = chunk.data
     if chunk.compression == "zstd":
         try:
-            # The frame's own size decides how much memory is taken: check it
+            # The zstd frame's own size decides how much memory is taken: check it
             # first.
             if zstandard.frame_content_size(data) != chunk.uncompressed_size:
                 return None
@@ -294,8 +294,8 @@ class Unpacked:
         self._bytes = EXPANSION_MOST * size + CHUNK_LIMIT
         self._records = size // INDEX_ENTRY + UNINDEXED_MOST
 
-    def chunk(self, frame: Frame) -> None:
-        found = chunk_head(frame.body)
+    def chunk(self, unparsed: UnparsedRecord) -> None:
+        found = chunk_head(unparsed.body)
         self._bytes -= found[0].uncompressed_size if found else 0
         if self._bytes < 0:
             raise RecordingError(f"{self._name}: its chunks unpack to more than {EXPANSION_MOST} times the file")
@@ -323,7 +323,7 @@ def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
             channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
             yield Message(channel_id, log_time, data[start + _MESSAGE_HEAD.size : end], publish_time, sequence)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = parse(Frame(at, opcode, data[start:end]), "chunk")
+            record = parse(UnparsedRecord(at, opcode, data[start:end]), "chunk")
             assert isinstance(record, Schema | Channel)
             yield record
         else:
