@@ -17,9 +17,9 @@ from triaxcald.tables.samples import Reading
 
 
 @dataclass(frozen=True)
-class Choice:
-    """How a recording is to be read: the user's word, else the recording's own,
-    else the default."""
+class FitSettings:
+    """Signs, reference and units of a fit: from the options, else from the recording,
+    else the defaults."""
 
     signs: tuple[int, int, int]
     reference: float
@@ -70,9 +70,9 @@ def reading_of(a: argparse.Namespace, name: str, of: tc.Calibration | None = Non
     )
 
 
-def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
-    """Raises InputError where what was said of the reference does not go
-    together."""
+def fit_settings(a: argparse.Namespace, measured: Measured) -> FitSettings:
+    """The settings of a fit. Raises InputError if options about the reference
+    contradict each other."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     if (latitude is None) != (height is None):
         raise InputError("--latitude, --height: give both, or neither")
@@ -82,7 +82,7 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
         raise InputError(f"--reference-unit {a.reference_unit}: --latitude and --height give the reference in g")
     local = None if latitude is None or height is None else tc.local_gravity_g(latitude, height)[0]
     reference = a.reference or local or measured.reference or 1.0
-    return Choice(
+    return FitSettings(
         a.sign or measured.signs or (1, 1, 1),
         reference,
         a.output_unit or (measured.profile.output.unit if measured.profile else measured.output_unit),
