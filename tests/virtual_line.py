@@ -20,7 +20,7 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.provision.access import Clock, RegisterLink
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run import line, session, write_back
+from triaxcald.run import session, unit_run, write_back
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
@@ -126,7 +126,7 @@ class OnModbus(VirtualDevice):
         return made
 
 
-class _VirtualRun(line.UnitRun):
+class _VirtualRun(unit_run.UnitRun):
     """By the unit's own clock, at the disk's speed."""
 
     def __init__(self, station: Any, place: Any, progress: Any, **more: Any) -> None:
@@ -158,7 +158,7 @@ def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Place, "device", device)
-        patch.setattr(line, "UnitRun", _VirtualRun)
+        patch.setattr(unit_run, "UnitRun", _VirtualRun)
         for module in (session, write_back):
             patch.setattr(module, "RegisterLink", _linked)
         patch.setattr(collection, "LOOK_SAMPLES_S", LOOK_S)

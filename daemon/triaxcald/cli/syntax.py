@@ -294,7 +294,7 @@ def _command(commands: Any, name: str, run: str, help_line: str, more: str = "",
 
 def _line(commands: Any) -> None:
     p = _command(
-        commands, "demo", "line:demo_command", "the whole line on two simulated units, in about a minute",
+        commands, "demo", "stations:demo_command", "the whole line on two simulated units, in about a minute",
         "A CAN and a Modbus unit with hidden effects are recorded, calibrated, written, power-cycled and verified.",
         "demo --out demo-out",
     )  # fmt: skip
@@ -302,7 +302,7 @@ def _line(commands: Any) -> None:
     p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
     add_json(p)
     p = _command(
-        commands, "run", "line:run_command", "the whole line on the devices of a station file",
+        commands, "run", "stations:run_command", "the whole line on the devices of a station file",
         "Guides the operator from pose to pose; records, calibrates, writes the registers and verifies them.",
         "run station.toml",
     )  # fmt: skip
@@ -314,7 +314,7 @@ def _line(commands: Any) -> None:
     add_force(p)
     add_json(p)
     p = _command(
-        commands, "sim", "line:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
+        commands, "sim", "stations:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
     )
     p.add_argument("device", metavar="DEVICE.toml", type=Path)
     p = _command(

@@ -24,7 +24,7 @@ from triaxcald.audit import audit
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
-from triaxcald.run.line import run_station
+from triaxcald.run.unit_run import run_station
 from triaxcald.station import output_check as confirmation
 from triaxcald.station.config import load_station
 from triaxcald.station.reconnect import RetryPolicy

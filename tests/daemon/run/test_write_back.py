@@ -21,7 +21,7 @@ from triaxcald.provision.procedure import restore
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.line import UnitRun
+from triaxcald.run.unit_run import UnitRun
 from triaxcald.run.write_back import WriteBack
 from triaxcald.simulation.unit import CALIBRATION, TABLE, Faults, Stored, factory_calibration
 from triaxcald.station.collection import Collection

@@ -1,4 +1,4 @@
-"""demo, run, sim."""
+"""The commands demo, run and sim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
-    from triaxcald.run.line import Outcome
+    from triaxcald.run.unit_run import Outcome
     from triaxcald.simulation.bench import SimulatedUnit
 
 
@@ -35,7 +35,7 @@ def run_command(a: argparse.Namespace) -> int:
 
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
-    from triaxcald.run.line import run_station
+    from triaxcald.run.unit_run import run_station
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
