@@ -35,15 +35,15 @@ Kind = Literal["read", "write"]
 RETRIES = 2
 """A lost request in a hundred then fails one request in a million."""
 NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
-"""Nothing came back; unlike a refusal, that says nothing about what the device
-did."""
+"""Errors without any answer. Unlike a refusal, they leave open whether the device
+carried the request out."""
 
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` as on the wire, written or read (empty where a read failed);
-    ``error`` the driver's message. ``unanswered``: nothing came back, not even
-    a refusal."""
+    """One register request: ``raw`` as on the wire, written or read (empty if a read
+    failed); ``error`` is the driver's message. ``unanswered``: no reply came, not
+    even a refusal."""
 
     kind: Kind
     register: str
@@ -87,11 +87,11 @@ class RegisterLink:
         self._watched = False
         self._second: TwoAnswer | None = None
         self.two_answered = self.tolerant = False
-        """Whether two units have answered, and whether that stops nothing."""
+        """Whether two units have answered, and whether the work continues anyway."""
         self.doubled = 0
         """Answers that came twice, byte for byte, since the last `listen`."""
         self.touched: set[str] = set()
-        """Registers that somebody has tried to write."""
+        """Registers with an attempted write."""
         self.probed: list[str] = []
         """Registers written by the restart check, one entry a write: a probe, or the
         register's own value again."""
@@ -111,12 +111,12 @@ class RegisterLink:
         return self._device.stream(names)
 
     def refresh(self) -> None:
-        """Be as patient as at first."""
+        """Allow all retries again."""
         self._tired.clear()
 
     def go_on_unrecorded(self) -> None:
-        """From now on no failure to record a request stops the work: putting a
-        device in order weighs more."""
+        """Continue if a request cannot be recorded: restoring the device has
+        priority."""
         record = self._record
 
         def lenient(access: RegisterAccess) -> None:
@@ -126,18 +126,21 @@ class RegisterLink:
         self._record = lenient
 
     def watch(self) -> None:
-        """From now on no answer too many goes unnoticed."""
+        """Report every extra answer from now on."""
         self._watched = True
 
     def tolerate(self) -> None:
-        """Puts a device in order also while two units answer."""
+        """Continue while two units answer, to restore the device."""
         self._watched, self._second = False, None
         self.tolerant = True
 
     async def listen(self, seconds: float) -> list[ExtraAnswer]:
-        """Waits so long by the host's clock. Returns the answers that no request
-        explains and that contradict the first answer; counts the others in
-        ``doubled``. None of a device whose driver cannot tell."""
+        """Listen for ``seconds`` of the host's clock.
+
+        Returns the answers that belong to no request and contradict the first
+        answer; counts the others in ``doubled``. A driver that cannot tell gives
+        none.
+        """
         listen = getattr(self._device, "listen", None)
         extra: list[ExtraAnswer] = [] if listen is None else await listen(seconds)
         self.doubled += sum(e.same for e in extra)
@@ -147,7 +150,7 @@ class RegisterLink:
         return await self._patiently("read", lambda: self._read(register))
 
     async def read_once(self, register: str) -> bytes:
-        """For a caller that repeats by itself."""
+        """Read without a repetition; the caller repeats."""
         return await self._read(register)
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
@@ -157,7 +160,7 @@ class RegisterLink:
             await self._patiently("write", lambda: self._write(register, raw, timeout_s))
 
     async def renew(self) -> None:
-        """A new connection, where one is to be had."""
+        """Open a new connection if possible."""
         with suppress(*NO_CONTACT):
             await self.close()
             await self.open()
@@ -217,8 +220,8 @@ class RegisterLink:
 
     @contextmanager
     def _failure_told(self, kind: Kind, register: str, raw: bytes) -> Iterator[None]:
-        """A device that could not be opened again says of a request only that
-        it is not open: what kept it from that is told instead."""
+        """Replace the error "not open" of a request by the error of the failed
+        opening."""
         try:
             yield
         except DriverError as e:

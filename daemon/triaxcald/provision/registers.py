@@ -35,8 +35,8 @@ from triaxcald.provision.identity import read_serial
 
 @dataclass(frozen=True)
 class Word:
-    """One register of an image. ``value`` is wanted and ``held`` is what
-    ``raw`` (bytes as on the wire) says, both in the register's ``unit``."""
+    """One register of an image. ``value`` is the wanted value, ``held`` the one that
+    ``raw`` (bytes as on the wire) encodes, both in the register's ``unit``."""
 
     register: str
     role: str
@@ -45,11 +45,11 @@ class Word:
     held: float
     unit: str
     step: float
-    """How far apart the values are that the register can hold there."""
+    """Distance of neighbouring register values there."""
 
     @property
     def cost(self) -> float:
-        """What the register's format changes: held − value, in ``unit``."""
+        """Rounding of the register's format: held − value, in ``unit``."""
         return self.held - self.value
 
 
@@ -264,7 +264,7 @@ TOLERANCE_G = 0.01
 bias at least; rounding, and an order of correction other than ours, make ones
 of the size of a product of two small coefficients."""
 LEAST = 3
-"""So few samples or poses say nothing."""
+"""Fewer samples or poses are no evidence."""
 
 
 def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] | None:
@@ -314,7 +314,7 @@ def departure_warnings(off_g: float | None) -> list[SanityWarning]:
 # May the readings be corrected already, by the registers that are to be written?
 
 NAMED = 3
-"""So many registers tell enough."""
+"""Number of registers named in a message."""
 
 
 class ReadingsNotStated(tc.Refused):
@@ -371,7 +371,7 @@ def _is_neutral(profile: Profile, name: str, raw: bytes) -> bool:
 
 
 def _nearest(profile: Profile, name: str, value: float) -> float:
-    """What the register holds for ``value``, which its format may not have."""
+    """Nearest register value to ``value``."""
     try:
         return profile.decode(name, profile.encode(name, value))
     except RegisterValueError:  # outside its limits

@@ -52,8 +52,8 @@ from triaxcald.station.power import power_cycle_asked
 
 @dataclass(frozen=True)
 class Provisioned:
-    """``error`` is one line where it failed; ``path`` is where the outcome was
-    written, if it was."""
+    """Result of a provisioning: ``error`` is one line if it failed, ``path`` that of
+    the written outcome, if any."""
 
     exit_code: int
     document: tc.interchange.Document
@@ -64,9 +64,9 @@ class Provisioned:
 
 @dataclass
 class ProvisionRun:
-    """Writes ``image``, meant for the unit ``serial``, to the device at
-    ``place``; without an image, the one of a provisioning that was cut short.
-    ``force`` is the reason to write in spite of warnings."""
+    """Writes ``image``, meant for the unit ``serial``, to the device at ``place``;
+    without an image, that of an interrupted provisioning. ``force`` is the reason to
+    write in spite of sanity warnings."""
 
     station: Station
     place: Place
@@ -75,16 +75,16 @@ class ProvisionRun:
     dry_run: bool = False
     force: str | None = None
     ask: Callable[[str], None] | None = None
-    """Shows the operator what to do; given, the supply is to be switched off
-    and on where nothing else shows what is stored."""
+    """Instructs the operator. If given, it asks for a power cycle when no restart
+    proves the stored values."""
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
     warnings: Sequence[SanityWarning] = field(default=(), init=False)
     _begun: Provisioning | None = field(default=None, init=False)
 
     async def run(self) -> Provisioned:
-        """Raises nothing, not even when it is cancelled: it says everything in
-        the outcome."""
+        """Provision. Raises nothing, not even when cancelled: the outcome has every
+        error."""
         ending: Ending | None = None
         try:
             with at_abort(self.abort_notice):
@@ -93,8 +93,8 @@ class ProvisionRun:
                     ending = Ending.of(Code.NOT_CHECKED, self._done())
                     if self.dry_run:
                         ending = replace(ending, code=None)
-        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the outcome is owed whatever happens
-            if ending is None:  # what only the closing was stopped in is done
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - every ending has an outcome
+            if ending is None:  # an error of the closing alone changes nothing
                 ending = aborted(e, self.provisioning)
         assert ending is not None
         document = self._document(ending)
@@ -109,7 +109,7 @@ class ProvisionRun:
         return Provisioned(ending.exit_code, document, self.provisioning, self._error(ending), path)
 
     def abort_notice(self, _: float) -> AbortNotice | None:
-        """What the end at once would leave behind."""
+        """State of the device after an abort at this moment."""
         p = self._begun
         return (
             AbortNotice(text.abort_notice(p, self.station.path), not p.settled)
@@ -122,7 +122,7 @@ class ProvisionRun:
         link = RegisterLink(device, bundle.profile, name=self.place.device_name)
         image = self.image or await self._image_of_journal(link)
         p = self._begin(link, image)
-        if self.image is not None and leaves_open(bundle.profile):  # a resume finishes what was begun
+        if self.image is not None and leaves_open(bundle.profile):  # a resume completes an earlier decision
             await p.look()
             self.provisioning = p
             require_readings_before(bundle.profile, p.found)
@@ -171,8 +171,7 @@ class ProvisionRun:
 
     @property
     def _open_journal(self) -> Path | None:
-        """The journal of an earlier provisioning, or of this one, where it is
-        still needed."""
+        """The journal of this or an earlier provisioning, if it is still needed."""
         if self._begun is not None and self._begun.identified:
             return self._begun.open_journal
         serial = self.serial or self.place.unit.serial
@@ -223,8 +222,8 @@ class ProvisionRun:
 
 @dataclass
 class RestoreRun(ProvisionRun):
-    """Puts ``snapshot`` back into the device at ``place``. ``source`` is the
-    recording or the journal that kept it."""
+    """Restores ``snapshot`` in the device at ``place``. ``source`` is the recording
+    or the journal that contains it."""
 
     snapshot: Snapshot = field(default_factory=lambda: Snapshot({}))
     source: Path | None = None
@@ -248,8 +247,8 @@ class RestoreRun(ProvisionRun):
 
 
 def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
-    """The registers that a recording or a journal has kept, and the name of the
-    unit. Raises InputError."""
+    """The register snapshot of a recording or a journal, and the name of the unit.
+    Raises InputError."""
     held, serial, unit = _kept(path)
     for name, raw in held.items():
         if name not in profile.registers:
@@ -262,7 +261,7 @@ def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
 
 
 def unit_in(path: Path) -> str | None:
-    """The name of the unit whose registers they are. Raises InputError."""
+    """The name of the unit in a recording or a journal. Raises InputError."""
     return _kept(path)[2]
 
 

@@ -49,18 +49,20 @@ from triaxcald.verification import (
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 FIRST_POSES = 4
-"""Of so many poses at the start of either stream at least one is in the other
-stream too."""
+"""Poses at the start of either stream of which at least one is in the other stream
+too."""
 REGISTERS_EARLIER = "registers-earlier.json"
-"""What the device held before an earlier provisioning that was cut short: what
-an undoing brings back."""
+"""Registers before an earlier, interrupted provisioning, which an undo restores."""
 
 
 @dataclass
 class WriteBack:
-    """``collect`` fetches check poses, ``ask`` shows the operator what to do;
-    ``force`` is the reason to go on in spite of `warnings`. ``verdict`` is the
-    one on the device's own output, None before it is judged."""
+    """Writes a calibration into the device and verifies it.
+
+    ``collect`` collects check poses, ``ask`` instructs the operator; ``force`` is
+    the reason to continue in spite of `warnings`. ``verdict`` is that on the
+    device's own output, None before it is judged.
+    """
 
     place: Place
     station: Station
@@ -104,8 +106,8 @@ class WriteBack:
         return p
 
     async def write(self, p: Provisioning, acquisition: Collection) -> None:
-        """Whatever is raised on the way, the old calibration has been put back
-        before, or `held` says what is not. Raises ProvisionError, StationError,
+        """Write and verify. Before any error is raised the old calibration is restored,
+        or `held` has the state of the device. Raises ProvisionError, StationError,
         DiskError."""
         with p.finishing():
             await p.write()
@@ -116,7 +118,7 @@ class WriteBack:
             self._attach(REGISTERS_AFTER, p.after.raw)
             self.writer.event("provisioned", {"written": list(p.written)})
             self.verdict = await self._verify(acquisition)
-        except (DiskError, WrongUnit, TwoAnswer):  # said as they are
+        except (DiskError, WrongUnit, TwoAnswer):  # raised unchanged
             await p.undo()
             raise
         except (DriverError, DaemonError, tc.TriaxcalError) as e:
@@ -147,7 +149,7 @@ class WriteBack:
         return departure_warnings(min(departures, default=None))
 
     async def _verify(self, acquisition: Collection) -> str:
-        """What the device's own output is judged to be."""
+        """Verify the device's own output in check poses; the verdict."""
         if CORRECTED not in self.place.bundle.profile.streams:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
@@ -174,16 +176,15 @@ class WriteBack:
 
 
 def corrected(collection: Collection, reference: float) -> Verification:
-    """What the device itself reported of a collection's poses."""
+    """The device's own output in the poses of a collection."""
     return verified(collection.pipelines[CORRECTED], reference)
 
 
 def _alignments(readings: Sequence[tc.Pose], outputs: Sequence[tc.Pose]) -> Iterator[list[tuple[tc.Pose, tc.Pose]]]:
-    """Poses of the two streams that lie over each other, for each way to lay
-    one over the other.
+    """Pairs of overlapping poses of the two streams, for each possible time shift.
 
-    Each stream counts its seconds from its own first sample, and either may
-    have begun some poses later.
+    Each stream counts its seconds from its own first sample, and either may begin
+    some poses later.
     """
     (r0, r1), (c0, c1) = (np.array([(p.start_s, p.end_s) for p in s]).reshape(-1, 2).T for s in (readings, outputs))
     apart_s = np.subtract.outer(r0, c0)
