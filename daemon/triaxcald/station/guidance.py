@@ -1,5 +1,4 @@
-"""What to tell the operator: how many poses are there, is it still now, where
-to turn next. Pure."""
+"""Guidance of the operator: number of poses, present stillness, next direction. Pure."""
 
 from __future__ import annotations
 
@@ -11,11 +10,10 @@ import numpy as np
 import triaxcal as tc
 
 COVERED_DEG = 25.0
-"""A pose covers the direction of the plan that it is nearest to, up to this far
-off."""
+"""Largest angle between a pose and the direction of the plan that it covers."""
 SAME_DEG = 10.0
-"""A repeated pose need not be nearer to the first than this, however near
-others may be to each other."""
+"""Angle to the first pose that always suffices for its repetition, however close other
+poses are to each other."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Guide:
     repeat_due: bool = False
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
-    """The poses keep coming where they were not wanted, and have to do."""
+    """Whether poses keep coming in unwanted directions, so that they must suffice."""
 
     @property
     def complete(self) -> bool:

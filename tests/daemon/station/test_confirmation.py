@@ -75,11 +75,11 @@ class Unit:
     def unconfirmed(self, first: int, detail: Any) -> None:
         self.marked.append((first, detail["error"]))
 
-    def mark(self) -> int:
+    def checkpoint(self) -> int:
         return self.offered
 
-    def back_to(self, mark: int) -> None:
-        self.back.append(mark)
+    def roll_back(self, checkpoint: int) -> None:
+        self.back.append(checkpoint)
 
     def confirmation(self, *, asks: bool = True) -> Confirmation:
         return Confirmation(
@@ -227,10 +227,10 @@ class Returned:
     def unconfirmed(self, first: int, _: Any) -> None:
         self.marked.append(first)
 
-    def mark(self) -> int:
+    def checkpoint(self) -> int:
         return self.offered
 
-    def back_to(self, mark: int) -> None: ...
+    def roll_back(self, checkpoint: int) -> None: ...
 
     async def record(self, trouble: Exception) -> int:
         self.trouble = trouble
