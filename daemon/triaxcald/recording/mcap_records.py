@@ -52,12 +52,12 @@ ATTACHMENT_LIMIT = 32 * 2**20  # a report is some MiB, the DBC of a whole vehicl
 INDEX_LIMIT = 8 * 2**20  # of the messages in one chunk
 RECORD_LIMIT = 2**20  # of all others; the longest of ours is the index of a chunk
 EXPANSION_MOST = 64
-"""So many times the file may unpack to, and one chunk: raw records come to a
-fifth or a tenth."""
+"""Largest ratio of unpacked to stored bytes of a file, plus one chunk; raw records have
+5 to 10."""
 INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
-"""Bytes of the file that each message has in an index, uncompressed. Those of a
-last chunk may have none."""
-_BLOCK = 2**16  # bytes that are looked at at once
+"""Bytes of each message in the uncompressed index of the file; number of messages that
+may lack an index, those of a last chunk."""
+_BLOCK = 2**16  # bytes read at once
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
@@ -69,7 +69,7 @@ _LIMITS: Mapping[int, int] = {
 
 
 class Damage(RecordingError):
-    """The bytes at ``offset`` are not what an MCAP file has there."""
+    """The bytes at ``offset`` are not valid MCAP."""
 
     def __init__(self, name: str, offset: int, what: str) -> None:
         super().__init__(f"{name}: {what} at byte {offset}; mend it with `triaxcal log recover`")
@@ -78,8 +78,7 @@ class Damage(RecordingError):
 
 
 class CutShort(Damage):
-    """The file ends before the record that begins at ``offset``, or in its
-    middle."""
+    """The file ends before or inside the record at ``offset``."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,8 @@ class UnparsedRecord:
 
 
 def check_magic(stream: BinaryIO, name: str) -> None:
-    """Raises CutShort where the file ends inside the magic, RecordingError
-    where it is something else."""
+    """Check the magic. Raises CutShort if the file ends inside it, RecordingError if it
+    is another file."""
     stream.seek(0)
     head = stream.read(HEAD_LOOKED_AT)
     magic = head[: len(MAGIC)]
@@ -117,8 +116,8 @@ def size_of(stream: BinaryIO) -> int:
 
 
 def written_to(stream: BinaryIO, size: int) -> int:
-    """Where the zeros begin that a file of ``size`` bytes ends with. After a
-    power failure a file may be longer than what of it reached the disk."""
+    """Offset of the trailing zeros of a file of ``size`` bytes. After a power failure a
+    file may be longer than its data that reached the disk."""
     end = size
     while end:
         begin = max(0, end - _BLOCK)
@@ -164,8 +163,8 @@ def walk(stream: BinaryIO, name: str, size: int) -> Iterator[UnparsedRecord]:
 
 
 def _index(stream: ReadDataStream) -> MessageIndex:
-    """Its entries, of which nothing here makes use, stay bytes: as numbers they
-    would take ten times the memory."""
+    """A message index without its unused entries, which as numbers would take ten times
+    the memory."""
     channel_id = stream.read2()
     stream.read(stream.read4())
     return MessageIndex(channel_id, [])
@@ -189,8 +188,8 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 def parse(unparsed: UnparsedRecord, name: str) -> McapRecord:
-    """The record in ``unparsed``, which must be as long as it says; chunks are for
-    `chunk_data`. Raises Damage."""
+    """Parse a record whose length must be exact; `chunk_data` reads chunks. Raises
+    Damage."""
     kind = _kind(unparsed.opcode)
     read = _READERS.get(unparsed.opcode)
     if read is None:
@@ -210,15 +209,15 @@ def parse(unparsed: UnparsedRecord, name: str) -> McapRecord:
 
 
 def footer_fits(unparsed: UnparsedRecord, crc: int) -> bool:
-    """Whether the footer's CRC is that of the summary before it, whose running
-    CRC is ``crc``."""
+    """Whether the footer's CRC matches the summary before it, whose running CRC is
+    ``crc``."""
     (expected,) = struct.unpack("<I", unparsed.body[-4:])
     return expected in (0, zlib.crc32(unparsed.body[:-4], zlib.crc32(unparsed.head, crc)))
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
-    """A chunk with what there is of its data, and the length these should have;
-    None where it cannot be."""
+    """A chunk with the available part of its data, and their stated length; None if the
+    bytes are no chunk."""
     try:
         start, end, uncompressed_size, crc = _CHUNK_HEAD.unpack_from(body)
         (name_length,) = struct.unpack_from("<I", body, _CHUNK_HEAD.size)
@@ -273,8 +272,8 @@ def unpack(chunk: Chunk) -> bytes | None:
 
 
 def unpack_part(chunk: Chunk) -> bytes:
-    """The records of a chunk that was cut off, as far as its bytes go; no CRC
-    can vouch for them."""
+    """The records of a truncated chunk, as far as its bytes go, without a check of
+    their CRC."""
     if chunk.compression != "zstd":
         return chunk.data
     source = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT).stream_reader(io.BytesIO(chunk.data))
@@ -285,9 +284,9 @@ def unpack_part(chunk: Chunk) -> bytes:
 
 
 class Unpacked:
-    """Counts what a file's chunks unpack to, which has to stay in proportion to
-    the file: a few bytes of compressed nothing keep a reader busy for as long
-    as they like. Raises RecordingError where it does not."""
+    """Limits the unpacked size of a file's chunks to a multiple of the file: a few
+    compressed bytes could keep a reader busy without end. Raises RecordingError above
+    the limit."""
 
     def __init__(self, name: str, size: int) -> None:
         self._name = name
@@ -307,8 +306,8 @@ class Unpacked:
 
 
 def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
-    """The whole records in ``data``; a last one that is cut off is left out.
-    Raises Damage, by its place in ``data``.
+    """The complete records in ``data``, without a truncated last one. Raises Damage
+    with its offset in ``data``.
 
     A chunk holds nothing but schemas, channels and messages.
     """

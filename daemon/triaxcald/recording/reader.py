@@ -1,5 +1,5 @@
-"""Reads a recording in bounded memory, one chunk at a time, and believes
-nothing that fails its CRC."""
+"""Reads a recording in bounded memory, one chunk at a time, and rejects data that
+fails its CRC."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ATTACHMENTS_MOST = 1000  # a run leaves a dozen
 
 
 class Attachments(Mapping[str, bytes]):
-    """Attachments by name; each is read from the file when it is asked for."""
+    """Attachments by name; each is read from the file on access."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -83,11 +83,11 @@ class Recording(Contents):
         self._stream = stream
         self._chunks: list[int] = []
         self._known: dict[int, tuple[frozenset[str], dict[int, str]]] = {}
-        """Of a chunk that was read to its end: the topics of its messages, and
-        the channels that it declares."""
+        """By chunk that was read to its end: topics of its messages, and channels that
+        it declares."""
         self._topics: dict[int, str] = {}
         self._said = 0  # bytes of metadata
-        self._unconfirmed: int | None = None  # the running index from which on raw records are so
+        self._unconfirmed: int | None = None  # running index of the first unconfirmed raw record
         self.size = size_of(stream)
         if not self.size:
             raise RecordingError(f"{name}: the file is empty; nothing was recorded")
@@ -119,8 +119,8 @@ class Recording(Contents):
         return recording
 
     def _heed_manifest(self, path: Path) -> None:
-        """Of a segment that was closed before another unit was noticed, the
-        manifest beside it says which records are unconfirmed."""
+        """Take the unconfirmed records from the manifest beside the segment, which may
+        have been closed before an exchange of the unit was noticed."""
         own = self.metadata.get(schema.SEGMENT_RECORD, {})
         of = own.get("of", "")
         if not is_manifest(of) or Path(of).name != of:
@@ -168,11 +168,11 @@ class Recording(Contents):
             self._known[offset] = frozenset(seen), channels
 
     def unparsed_records(self) -> Iterator[UnparsedRecord]:
-        """Every record of the file in its order, as bytes."""
+        """Every record of the file in order, unparsed."""
         return walk(self._stream, self.name, self.size)
 
     def _records(self, offset: int) -> Iterator[Schema | Channel | Message]:
-        """Of the chunk at ``offset``."""
+        """Records of the chunk at ``offset``."""
         data = chunk_data(self.unparsed(offset), self.name)
         try:
             yield from chunk_records(data)
@@ -186,8 +186,7 @@ class Recording(Contents):
             raise RecordingError(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
 
     def _survey(self) -> None:
-        """Notes where everything is and checks the two CRCs that together cover
-        every byte."""
+        """Index the file, and check the two CRCs that together cover every byte."""
         crc = zlib.crc32(MAGIC)
         unpacked = Unpacked(self.name, self.size)
         for unparsed in walk(self._stream, self.name, self.size):
@@ -205,8 +204,7 @@ class Recording(Contents):
                 crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
 
     def _reaches_zeros(self, offset: int) -> bool:
-        """Whether the record that begins there was not wholly written before
-        the zeros that the file ends with."""
+        """Whether the record at ``offset`` reaches into the zeros at the end."""
         if self._written == self.size:
             return False
         return offset + HEAD.size > self._written or self.unparsed(offset).end > self._written

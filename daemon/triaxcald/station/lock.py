@@ -2,11 +2,10 @@
 users.
 
 The kernel keeps a lock (flock) on a file for each and releases it at every end of
-the process. The content of a file only names the holder;
-what a killed process left there means nothing. The files lie in one folder for
-all users of the machine, and stay there: somebody may be about to lock one.
-Where there is no flock (outside POSIX) commands of one process exclude each
-other, and processes do not.
+the process. The content of a file only names the holder; that of a killed process
+has no meaning. The files lie in one folder for all users of the machine, and stay
+there, since another process may be about to lock one. Without flock (outside POSIX)
+only commands of one process exclude each other.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 _NMT_START = 1
 _HEARTBEAT, _BOOTED = 0x700, b"\0"
-"""Of CiA 301: a node that has booted says so by a heartbeat of state 0."""
+"""CiA 301: a node sends a heartbeat of state 0 after booting."""
 _BOOT_LOOK_S = 0.1
 """How often a stream that brings nothing checks whether the node has booted."""
 _ABORTED, _ABORT = 0x80, b"\x80"
@@ -75,7 +75,7 @@ class PatientSdo(SdoClient):
         super().send_request(request)  # type: ignore[no-untyped-call]
 
     def receive(self, response: bytes) -> None:
-        """From the receive thread: each answer of the node, whoever asked."""
+        """Take an answer of the node to any client. Runs in the receive thread."""
         # Segments name no object: only the answer that begins a transfer counts.
         # An abort of the segments belongs to the same transfer.
         ends_segments = self._in_segments and response[:1] == _ABORT and self._named_by(response) == self._object
@@ -120,7 +120,7 @@ class PatientSdo(SdoClient):
 
 
 class _Sender:
-    """In the place of canopen's network, which wants a bus of its own."""
+    """Replaces canopen's network, which needs a bus of its own."""
 
     def __init__(self, line: CanLine) -> None:
         self._line = line
@@ -201,7 +201,7 @@ class CanDevice:
         return _HEARTBEAT + self._settings.node_id
 
     def _on_heartbeat(self, frame: Frame) -> None:
-        """In the receive thread."""
+        """Take a heartbeat. Runs in the receive thread."""
         booted, connection = self._booted, self._connection
         if frame.data == _BOOTED and booted is not None and connection is not None:
             with suppress(RuntimeError):  # the loop has ended
@@ -232,8 +232,8 @@ class CanDevice:
                 raise DeviceAbsent(f"{self._settings} is not a {identity.product}: {e}") from e
 
     async def _read_when_ready(self, register: str) -> bytes:
-        """As `read`; a node that refuses for now, as one does that starts or
-        stores, is asked again. Raises DeviceBusy after `BUSY_S`."""
+        """Read, and repeat the request while a starting or storing node refuses.
+        Raises DeviceBusy after `BUSY_S`."""
         now_s = self._connected().line.clock.now_s
         until_s = now_s() + BUSY_S
         while True:

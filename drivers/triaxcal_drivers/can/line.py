@@ -52,8 +52,8 @@ def open_bus(settings: BusSettings) -> Adapter:
 
 
 async def opened(opening: Callable[[], T], closing: Callable[[T], object]) -> T:
-    """What ``opening`` gives, called in a thread, which closes it again where
-    nobody waits for it any more. Raises what ``opening`` does."""
+    """Result of ``opening`` in a thread, which closes it again if nobody waits for it
+    any more. Raises the errors of ``opening``."""
     given_up = threading.Event()
 
     def open_unless_given_up() -> T:
@@ -150,8 +150,8 @@ class FrameQueue:
         return False
 
     def put(self, frames: Sequence[Frame], socketcan_errors: bool = True) -> None:
-        """From the receive thread. What error frames say is read where they are
-        SocketCAN's."""
+        """Take received frames. Error frames are decoded if they are SocketCAN's. Runs
+        in the receive thread."""
         wanted = self._identifiers
         if wanted is None or self._failure is not None:
             return
@@ -189,7 +189,7 @@ class FrameQueue:
         self._loss = loss.and_before(self._loss)
 
     def fail(self, failure: Exception) -> None:
-        """From the receive thread, when receiving has failed."""
+        """Take a failure of receiving. Runs in the receive thread."""
         self._failure = failure
         self._tell(self._some)
         self._tell(self._enough)
@@ -259,10 +259,10 @@ class FrameQueue:
 _SENT, _NO_DATA = int(RawFlag.SENT), int(RawFlag.ERROR | RawFlag.REMOTE)
 
 POLL_S = 0.1
-"""How long closing waits for the receive thread to look up."""
+"""Period in which the receive thread checks for the closing."""
 JOIN_S = 2.0
-"""A driver that hangs in its own call is left to itself after this time: the
-bus is opened anew all the same."""
+"""Time to wait for a driver that hangs in a call; then the bus is opened anew without
+it."""
 MUTE_S = 5.0
 """A bus on which nobody was heard for so long is opened anew when a unit on it
 is: an adapter may hang without an error. Ten times the slowest heartbeat that
@@ -270,8 +270,8 @@ is usual on a bus in use."""
 
 
 class CanLine:
-    """To be had by `join`. ``clock`` measures its time-outs;
-    ``openings`` counts how often it has been opened."""
+    """A shared CAN line; `join` gives it. ``clock`` measures its time-outs,
+    ``openings`` counts its openings."""
 
     def __init__(self, settings: BusSettings) -> None:
         self.settings = settings
@@ -287,7 +287,7 @@ class CanLine:
         self._failure: BusError | None = None
 
     async def open(self) -> None:
-        """Nothing where it is open and heard from. Raises BusError."""
+        """Open the line, unless it is open and receives frames. Raises BusError."""
         async with self._opening:
             if self._adapter is not None and self.clock.now_s() - self._heard_s < MUTE_S:
                 return
@@ -304,7 +304,7 @@ class CanLine:
             self._thread.start()
 
     async def close(self) -> None:
-        """Also the time-outs of all who still wait for something."""
+        """Close the line; the time-outs of all who still wait expire."""
         self.clock.close()
         async with self._opening:
             await self._close()
@@ -376,7 +376,7 @@ class CanLine:
             queue.fail(failure)
 
     def _receive(self, adapter: Adapter) -> None:
-        """In a thread of its own, until the adapter is closed or fails."""
+        """Receive in a thread of its own, until the adapter is closed or fails."""
         while self._adapter is adapter:
             try:
                 frames = adapter.receive(POLL_S)
@@ -470,7 +470,7 @@ class BusListener:
         self._first: RawBatch | None = None  # which `settled` has seen
 
     async def open(self) -> None:
-        """What comes from now on is given. Raises BusError."""
+        """Open the bus; the stream has the frames from now on. Raises BusError."""
         await self.close()
         line = await join(self._settings)
         frames = FrameQueue(line.clock, capacity=LISTENER_CAPACITY)
