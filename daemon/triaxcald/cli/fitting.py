@@ -47,8 +47,7 @@ DEFAULT_SIGNS = (
     "and nothing in the data tells"
 )
 Way = tuple[Measured, tc.interchange.Document, tc.estimate.Calibration, Callable[[], None]]
-"""What was measured, the document, the calibration, and how it is shown at the
-console."""
+"""Measurement, document, calibration, and the function that shows it at the console."""
 
 
 def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | None:
@@ -279,7 +278,7 @@ COLUMNS = {
     "one value": "probability that its coefficients are the same in all, if it does",
     "in each unit by itself": "probability that it acts there, by that unit alone, in the order of the recordings",
 }
-"""What stands in the table of all units."""
+"""Columns of the table of all units."""
 
 
 def measured_each(a: argparse.Namespace) -> list[Measured]:
@@ -311,8 +310,7 @@ def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None
 
 
 def _place(name: str) -> Path | None:
-    """Where a recording lies, however its path is written; None for standard
-    input."""
+    """Resolved path of a recording; None for standard input."""
     return None if name == "-" else Path(name).resolve()
 
 
@@ -336,7 +334,7 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
 
 
 def named_quality(m: Measured) -> list[str]:
-    """Its data quality, where that stands beside another recording's."""
+    """Data quality with the name of the recording, for several recordings."""
     return [f"{m.name}: {line}" for line in m.data_quality]
 
 
@@ -641,7 +639,7 @@ def write_results(
 
 
 def title_of(name: str) -> str:
-    """Of a report: the file's name, wherever it lies."""
+    """Title of a report: the name of the file without its folder."""
     return "standard input" if name == "-" else Path(name).name
 
 

@@ -113,9 +113,11 @@ def _placed(
     given: Labels | None,
     assumed: tc.frames.Assumed,
 ) -> tuple[Source, tc.frames.Standing]:
-    """On a level table a turn and a knock look the same but for their length.
-    Labels, where they count the poses, say how many of the longest were
-    turns."""
+    """Poses of a recording, split at half turns.
+
+    On a level table a turn and a knock differ in their length alone. If labels state
+    the number of poses, that many of the longest disturbances were turns.
+    """
     measured = read_recording(a, name, turn_s=tc.poses.TURN_S)
     with telling_data_quality(measured):
         source = _source(a, measured, name, calibration, taken)
@@ -131,8 +133,8 @@ def _placed(
 
 
 def _lengths(measured: Measured) -> list[float]:
-    """How long disturbances lasted that left the readings as they were, the
-    longest first."""
+    """Durations of the disturbances that did not change the readings, the longest
+    first."""
     if measured.windows is None:
         return []
     found = {span.since_s for span in tc.poses.find_spans(measured.windows, turn_s=0.0)}

@@ -275,13 +275,13 @@ def _added(found: tc.planning.MissingPoses, pose: tc.planning.Addition) -> tc.in
 def _of_all(
     effects: Sequence[tc.effects.Effect], errors: Mapping[str, Mapping[str, float | None]]
 ) -> dict[str, Mapping[str, float | None]]:
-    """With the effects for which the recording has no channel."""
+    """Errors by effect, with those effects for which the recording has no channel."""
     return {e.name: errors.get(e.name) or dict.fromkeys(c.name for c in e.coefficients) for e in effects}
 
 
 def _not_shown(found: tc.planning.MissingPoses, effects: Sequence[tc.effects.Effect]) -> dict[str, str]:
-    """In words, by effect: what of it the poses there cannot show, and whether
-    the poses to add do."""
+    """Text by effect: its part that the existing poses cannot show, and whether the
+    added poses show it."""
     out = {}
     for effect in effects:
         lost = [n for n in effect.needs if n in found.absent]

@@ -43,8 +43,7 @@ def provision_command(a: argparse.Namespace) -> int:
 
 
 def _told(done: Provisioned, station: Path) -> str:
-    """What came of it, and what would settle it; nothing where the error said
-    so."""
+    """Result and recovery command; empty if the error has them already."""
     p = done.provisioning
     if p is None or done.error is not None:
         return ""

@@ -67,7 +67,7 @@ def info_command(a: argparse.Namespace) -> int:
 
 
 def _samples(path: Path, phases: Iterable[str]) -> dict[str, Any]:
-    """As `samples_of`; where the profile cannot be used, the ``fault``."""
+    """`samples_of`, or the ``fault`` of an unusable profile."""
     try:
         with open_recording(path, unfinished=True) as recording:
             return samples_of(recording, phases)

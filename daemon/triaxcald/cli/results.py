@@ -1,4 +1,4 @@
-"""What a fit and a diagnosis found, as a person reads it at the console."""
+"""Results of a fit and a diagnosis, for the console."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def weighted(r: tc.estimate.Residual) -> str:
 
 
 def temperature_of(c: tc.estimate.Calibration) -> str:
-    """Where the values of a model without temperature are known to hold; empty
-    for any other."""
+    """Temperature for which the values of a model without temperature hold; empty for
+    other models."""
     of_poses = [p.pose.channels.get(tc.effects.TEMPERATURE, math.nan) for p in c.poses if p.used]
     modelled = any(tc.effects.TEMPERATURE in effect.needs for effect, _ in c.sensor.effects)
     if modelled or not of_poses or not all(map(math.isfinite, of_poses)):
@@ -54,8 +54,8 @@ def temperature_of(c: tc.estimate.Calibration) -> str:
 
 
 def held_at(mean: float, lowest: float, highest: float, of: str) -> str:
-    """At which temperature the values hold, the mean over the poses or samples
-    ``of`` the fit."""
+    """Sentence about the temperature for which the values hold: the mean over the poses
+    or samples ``of`` the fit."""
     low, middle, high = (f"{v:.4g}" for v in (lowest, mean, highest))
     spread = "" if low == high else f", the mean of the {of} ({low} to {high} °C)"
     return f"scale factor, misalignment and bias are those at {tc.effects.TEMPERATURE} = {middle} °C{spread}"

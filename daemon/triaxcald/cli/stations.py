@@ -50,7 +50,7 @@ def run_command(a: argparse.Namespace) -> int:
 
 
 def _told(outcomes: Sequence[Outcome]) -> str:
-    """What came of the units of which no error was said."""
+    """Outcomes of the units without an error message."""
     each = [
         (o, [f"{o.document['verdict']}: {o.document['reason']}", o.recovery_command])
         for o in outcomes

@@ -185,7 +185,7 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
 
 
 def add_table(parser: argparse.ArgumentParser) -> None:
-    """How a table is to be read that is no recording of ours."""
+    """Options for reading a table."""
     g = parser.add_argument_group("tables", "text with separators, or Parquet; what is clear is guessed and said")
     g.add_argument(
         "--columns", type=_columns, metavar="t=T,ux=X,uy=Y,uz=Z",
@@ -215,7 +215,7 @@ def _condition(text: str) -> tuple[str, str]:
 
 
 def add_uncertainty(parser: argparse.ArgumentParser) -> None:
-    """What is known of the reference and the thermometer, for the budget."""
+    """Options about the reference and the thermometer, for the budget."""
     parser.add_argument(
         "--latitude", type=latitude, metavar="DEG", help="with --height: gravity there is the reference"
     )
@@ -271,7 +271,7 @@ READINGS = "readings"
 
 
 def register(commands: Any) -> None:
-    """In the order in which a newcomer meets them."""
+    """Add the commands in the order in which a newcomer meets them."""
     _line(commands)
     _on_recordings(commands)
     _planning(commands)
