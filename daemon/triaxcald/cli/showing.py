@@ -142,7 +142,7 @@ def warn(lines: Iterable[str]) -> None:
 @contextmanager
 def telling_data_quality(measured: Measured) -> Iterator[None]:
     """Adds the data quality, a possible cause, to a refusal. Drops the wanted poses if
-    the recording has unconfirmed records."""
+    most of the recording is unused."""
     try:
         yield
     except tc.Refused as e:

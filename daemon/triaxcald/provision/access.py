@@ -59,7 +59,7 @@ class RegisterLink:
     `RETRIES` times where no answer came, over a new connection where the old
     one was lost, and for `BUSY_S` where the device is busy. What a store or
     reset sequence writes is sent once. Once a kind of request has failed for
-    good, no more patience is spent on that kind until one succeeds, or until
+    good, no more retries are spent on that kind until one succeeds, or until
     `refresh`. ``record`` is told of every request that has ended. ``name`` is
     the device at its address, for messages.
 
