@@ -25,7 +25,7 @@ from triaxcal.estimate.calibration import HighLeverage, PoorSpread
 from triaxcal.text import caution
 from triaxcal.text.advice import chance
 from triaxcald.inputs import Measured, measure
-from triaxcald.tables.own_text import read_csv
+from triaxcald.tables.native_csv import read_csv
 
 PROJECT = Path(__file__).parents[1]
 HEAD = [

@@ -18,9 +18,9 @@ import pytest
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
-from triaxcald.provision.access import Pace, RegisterLink
+from triaxcald.provision.access import Clock, RegisterLink
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run import line, session, write_back
+from triaxcald.run import session, unit_run, write_back
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
@@ -53,9 +53,9 @@ class VirtualDevice:
         return START_NS + round(self.time_base.now_s() * 1e9)
 
     @property
-    def pace(self) -> Pace:
+    def clock(self) -> Clock:
         """What a deadline goes by. A pause takes none of this time, since nothing is asked in it."""
-        return Pace(lambda _: asyncio.sleep(0), self.time_base.now_s)
+        return Clock(lambda _: asyncio.sleep(0), self.time_base.now_s)
 
     async def open(self) -> None:
         await self.time_base.advance(REQUEST_S)
@@ -126,8 +126,8 @@ class OnModbus(VirtualDevice):
         return made
 
 
-class _VirtualRun(line.UnitRun):
-    """By the unit's own clock, at the disk's pace."""
+class _VirtualRun(unit_run.UnitRun):
+    """By the unit's own clock, at the disk's speed."""
 
     def __init__(self, station: Any, place: Any, progress: Any, **more: Any) -> None:
         self._device = place.device()
@@ -140,7 +140,7 @@ class _VirtualRun(line.UnitRun):
 
 def _linked(device: VirtualDevice, *arguments: Any, **settings: Any) -> RegisterLink:
     """By the host's clock a store would stall while another unit's fit keeps this one from being asked."""
-    return RegisterLink(device, *arguments, **settings, pace=device.pace)
+    return RegisterLink(device, *arguments, **settings, clock=device.clock)
 
 
 @contextlib.contextmanager
@@ -158,7 +158,7 @@ def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Place, "device", device)
-        patch.setattr(line, "UnitRun", _VirtualRun)
+        patch.setattr(unit_run, "UnitRun", _VirtualRun)
         for module in (session, write_back):
             patch.setattr(module, "RegisterLink", _linked)
         patch.setattr(collection, "LOOK_SAMPLES_S", LOOK_S)

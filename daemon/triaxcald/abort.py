@@ -1,9 +1,8 @@
-"""The end at once, without unwinding: what is still done before it, what is
-said, and the exit code.
+"""Abort: ends the process at once, without unwinding, after registered actions, one
+message and with the right exit code.
 
-It comes from a signal handler, in the midst of whatever the main thread was
-doing. What it calls therefore takes no lock that the main thread could hold,
-and waits for nothing without a bound.
+A signal handler calls it, in the middle of any work of the main thread. Actions
+therefore take no lock that the main thread could hold, and every wait is bounded.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from triaxcald.printable import printable
 STOP_SIGNALS = [s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)) is not None]
 DEVICE, INTERRUPTED = 4, 130
 CLOSING_S = 1.0
-"""For all that is still to be done, together: a disk that works has long
-finished a recording by then."""
+"""Time limit of all actions together; a working disk finishes a recording in much
+less."""
 
 
-class Left(NamedTuple):
-    """What the end leaves behind, in words; ``in_doubt`` where nobody can vouch
-    for what a device holds."""
+class AbortNotice(NamedTuple):
+    """Message about what an abort leaves behind; ``in_doubt`` if the state of a device
+    is not settled."""
 
     note: str
     in_doubt: bool = False
 
 
-Action = Callable[[float], Left | None]
-"""Is given the time (`time.monotonic`) until which it may take. Raises nothing."""
+Action = Callable[[float], AbortNotice | None]
+"""Receives its deadline (`time.monotonic`). Raises nothing."""
 
 _actions: dict[object, Action] = {}
 
 
 def add_action(key: object, action: Action) -> None:
-    """To be done at the end at once, until `discard_action`."""
+    """Register an action of an abort, until `discard_action`."""
     _actions[key] = action
 
 
@@ -51,7 +50,7 @@ def discard_action(key: object) -> None:
 
 @contextmanager
 def at_abort(action: Action) -> Iterator[None]:
-    """What is to be done where the process is ended at once in this context."""
+    """Runs ``action`` if the process is aborted within this context."""
     key = object()
     add_action(key, action)
     try:
@@ -61,16 +60,16 @@ def at_abort(action: Action) -> Iterator[None]:
 
 
 def abort(reason: str) -> NoReturn:
-    """Ends the process: 130, or 4 where a device is in doubt; one line on
-    standard error."""
+    """End the process with exit code 130, or 4 if a device is in doubt, and one line
+    on standard error."""
     said, code = [reason], INTERRUPTED
     try:
         ignore_stop_signals()
         until_s = time.monotonic() + CLOSING_S
         for action in reversed(list(_actions.values())):
-            if (left := action(until_s)) is not None:
-                said.append(left.note)
-                code = DEVICE if left.in_doubt else code
+            if (notice := action(until_s)) is not None:
+                said.append(notice.note)
+                code = DEVICE if notice.in_doubt else code
         tell(f"triaxcal: {'; '.join(said)}")
     finally:
         os._exit(code)
@@ -95,13 +94,13 @@ def ignore_stop_signals() -> None:
 
 
 def tell(line: str) -> None:
-    """A line to standard error, also in the midst of a write to it; nowhere,
-    where it is closed or nobody reads."""
+    """Write a line to standard error, even during another write to it; drop it if the
+    stream is closed or its reader does not keep up."""
     steer(f"{printable(line)}\n")
 
 
 def steer(text: str) -> None:
-    """The same of a text of our own as it is, which the terminal may obey."""
+    """Write our own text unchanged, with control sequences for the terminal."""
     with suppress(AttributeError, OSError, ValueError):
         descriptor = sys.stderr.fileno()
         if select.select([], [descriptor], [], 0)[1]:

@@ -28,9 +28,9 @@ from triaxcal_drivers.roles import (
     REFERENCE_ROLE,
     SCALE_FACTOR,
 )
+from triaxcald.caveats import is_passing
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
-from triaxcald.doubts import is_passing
 from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest

@@ -72,13 +72,13 @@ class DecodedStream:
         """From the first sample to the latest."""
         return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
 
-    def mark(self) -> tuple[Counter[str], tuple[Any, ...]]:
-        """What it has come to so far, for `back_to`."""
+    def checkpoint(self) -> tuple[Counter[str], tuple[Any, ...]]:
+        """What it has come to so far, for `roll_back`."""
         return self.counts.copy(), (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns)
 
-    def back_to(self, mark: tuple[Counter[str], tuple[Any, ...]]) -> None:
+    def roll_back(self, checkpoint: tuple[Counter[str], tuple[Any, ...]]) -> None:
         """As if nothing had come since. No more records may be fed."""
-        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = mark
+        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = checkpoint
         self.counts = counts.copy()
 
     def feed(self, batch: RawBatch) -> SampleBlock:

@@ -16,7 +16,7 @@ import triaxcal as tc
 from triaxcald.errors import INTERRUPTED, InputError
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
-from triaxcald.run.line import Outcome, UnitRun, run_station
+from triaxcald.run.unit_run import Outcome, UnitRun, run_station
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station

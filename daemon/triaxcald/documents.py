@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import triaxcal as tc
-from triaxcald.doubts import UNIT, choices_of
+from triaxcald.caveats import UNIT, correction_options
 
 NO_LONGER_OF_A_FINDING = ("p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g")
 NO_LONGER_OF_WHAT_IS_UNEXPLAINED = ("p_value", "or_spoiled", "or_named", "only_inside")
@@ -75,7 +75,7 @@ def loop_document(
                 "terms": list(choice.terms),
                 **tc.interchange.residual_document(choice.residual, reference),
             }
-            for choice in choices_of(loop, held_by_device)
+            for choice in correction_options(loop, held_by_device)
         ],
         "unexplained": _unexplained(loop.found.unexplained, small, reference),
         **({"doubts": [UNIT]} if unit_in_doubt or loop.found.change_point else {}),

@@ -62,7 +62,7 @@ class ProvisionError(StationError):
 
 
 class NoPoses(tc.Refused):
-    """No new still pose came within the patience of the plan."""
+    """No new still pose came within `plan.patience_s`."""
 
 
 class Implausible(DaemonError):

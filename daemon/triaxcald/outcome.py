@@ -139,7 +139,7 @@ def outcome_document(
 ) -> tc.interchange.Document:
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
-    needed, ``forced`` the reason for which doubts were overruled."""
+    needed, ``forced`` the reason for which sanity warnings were overruled."""
     return {
         "format": FORMAT,
         "unit": unit,
@@ -186,7 +186,7 @@ def registers_told(p: Provisioning) -> tc.interchange.Document:
     return {
         "differing": list(p.differing),
         "written": list(p.written),
-        "marked": list(p.link.marked),
+        "marked": list(p.link.probed),
         "stored": p.stored,
         "cut_short_before": p.carried,
         "undoing_failed": p.undoing_failed,

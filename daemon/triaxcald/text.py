@@ -13,7 +13,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Held
 
 if TYPE_CHECKING:
     from triaxcald.provision.procedure import Provisioning
-    from triaxcald.provision.registers import Doubt
+    from triaxcald.provision.registers import SanityWarning
 
 _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
     (DeviceState.UNTOUCHED, None): "no register was written",
@@ -174,14 +174,14 @@ def held(of: Held) -> str:
     return _HELD.get((of.state, of.evidence)) or _HELD[of.state, None]
 
 
-def settling(p: Provisioning, station: Path) -> str:
-    """The command that clears up what the device holds; empty where nothing is
-    left to be cleared up."""
-    return "" if p.settled else to_settle(p.held, p.open_journal, p.unit, station)
+def recovery_command(p: Provisioning, station: Path) -> str:
+    """The command that settles the state of the device; empty if it is settled."""
+    return "" if p.settled else _command_to_settle(p.held, p.open_journal, p.unit, station)
 
 
-def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
-    """The same, by the journal where there is one."""
+def _command_to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
+    """The command for a device in the state ``of``, with the journal if there is
+    one."""
     provision = f"triaxcal provision {'--resume' if journal else 'CAL.json'} {station} --unit {unit}"
     restore = f"triaxcal restore {journal or 'REC'} {station} --unit {unit}"
     told = f" (journal: {journal})" if journal else ""
@@ -193,20 +193,22 @@ def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
 
 
 def unfinished(journal: Path, unit: str, station: Path) -> str:
-    """Of a device that this run has not examined."""
+    """Notice about a journal whose device this run has not examined."""
     unknown = Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-    return f"an earlier provisioning was cut short or not verified; {to_settle(unknown, journal, unit, station)}"
+    return (
+        f"an earlier provisioning was cut short or not verified; {_command_to_settle(unknown, journal, unit, station)}"
+    )
 
 
-def left(p: Provisioning, station: Path) -> str:
-    """What the device holds, and the command that clears it up."""
-    return "; ".join(filter(None, (held(p.held), settling(p, station))))
+def abort_notice(p: Provisioning, station: Path) -> str:
+    """State of the device, and the recovery command."""
+    return "; ".join(filter(None, (held(p.held), recovery_command(p, station))))
 
 
 def provisioned(p: Provisioning) -> str:
     """What was done, and what the device holds now."""
     if not p.written:
-        marked = ", ".join(dict.fromkeys(p.link.marked))
+        marked = ", ".join(dict.fromkeys(p.link.probed))
         wrote = (
             f"; only {marked} was written, to show a restart, and holds its value again"
             if marked
@@ -278,7 +280,7 @@ def _checked(verification: Mapping[str, Any]) -> str:
     return f"{tc.number_format.micro_g(verification['after_rms_g'])}{told} off"
 
 
-def doubt(of: Doubt) -> str:
+def sanity_warning(of: SanityWarning) -> str:
     match of.kind:
         case "not_a_number":
             return f"{of.register} holds no number"
@@ -294,14 +296,15 @@ def doubt(of: Doubt) -> str:
             return f"{of.register} holds {of.value:.6g}, expected {of.low:g} to {of.high:g}"
 
 
-MOST_DOUBTS = 3
-"""So many are listed: what makes one register absurd makes most of them so."""
+MOST_WARNINGS = 3
+"""Number of warnings listed: one cause, such as a wrong word order, affects most
+registers."""
 
 
-def doubted(of: Sequence[Doubt]) -> str:
-    """Why nothing is written."""
-    listed = "; ".join(doubt(d) for d in of[:MOST_DOUBTS])
-    more = f"; and {len(of) - MOST_DOUBTS} more" if len(of) > MOST_DOUBTS else ""
+def refused_by_sanity_warnings(of: Sequence[SanityWarning]) -> str:
+    """Refusal to write because of sanity warnings."""
+    listed = "; ".join(sanity_warning(w) for w in of[:MOST_WARNINGS])
+    more = f"; and {len(of) - MOST_WARNINGS} more" if len(of) > MOST_WARNINGS else ""
     return (
         f"what the device holds is no calibration under its profile (word order, scaling, addresses?): {listed}{more}; "
         "nothing was written; --force REASON writes all the same"

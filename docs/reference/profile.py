@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from triaxcal_drivers.registers import TYPES, Whole, in_words
+from triaxcal_drivers.registers import TYPES, Integer, in_words
 from triaxcal_drivers.schema import schema
 
 HERE = Path(__file__).parent
@@ -28,7 +28,7 @@ def pages() -> dict[Path, str]:
 def _row(name: str) -> str:
     type_ = TYPES[name]
     words = "yes" if in_words(name) else "no"
-    ends = (str(e) if isinstance(type_, Whole) else f"{e:.4g}" for e in (type_.lowest, type_.highest))
+    ends = (str(e) if isinstance(type_, Integer) else f"{e:.4g}" for e in (type_.lowest, type_.highest))
     return f"| `{name}` | {type_.size} | {' | '.join(ends)} | {type_.step(1.0):.3g} | {words} |\n"
 
 

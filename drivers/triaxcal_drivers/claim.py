@@ -1,8 +1,7 @@
-"""What a process claims for itself while it has a unit open, by names that do
-not depend on the spelling.
+"""Claims of a process on an open unit, by names that do not depend on the spelling.
 
-A driver's bus model says it by a method ``claim``; `claim_of` asks for it. No
-I/O but the links of the file system.
+A driver's bus model states them by a method ``claim``; `claim_of` calls it. No I/O
+except links of the file system.
 """
 
 from __future__ import annotations

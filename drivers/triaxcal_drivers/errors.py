@@ -1,7 +1,7 @@
-"""What can go wrong between the profile, the bus and the device.
+"""Errors of the profile, the bus and the device.
 
-The leaf names whose fault it is; the message is one line that says what, where,
-and what was expected.
+The leaf class names the party at fault; the message is one line with the fault, its
+place and the expected value.
 """
 
 

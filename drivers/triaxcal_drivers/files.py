@@ -34,7 +34,7 @@ _TOML_FORMAT = re.compile(rb"""^[ \t]*format[ \t]*=[ \t]*["'](triaxcal\.[\w-]{1,
 
 
 def kind(data: bytes) -> str:
-    """What a file that begins with ``data`` is, with its article."""
+    """Kind of a file that begins with ``data``, with its article."""
     if known := special_kind(data):
         return known
     head = data[:HEAD]
@@ -49,8 +49,8 @@ def kind(data: bytes) -> str:
 
 
 def special_kind(data: bytes, *, json: bool = True, toml: bool = True) -> str | None:
-    """The same where a mark tells it; None of other text and of what nobody
-    knows. Without ``json`` or ``toml`` such a document is no special kind."""
+    """Kind by a magic number or a format key; None for other text and unknown data.
+    Without ``json`` or ``toml`` such a document is no special kind."""
     head = data[:HEAD]
     if _NO_TEXT.search(head[:_MAGIC_HEAD]):
         for magic, name in _MAGICS:
@@ -66,7 +66,7 @@ def special_kind(data: bytes, *, json: bool = True, toml: bool = True) -> str | 
 
 
 def document_kind(data: bytes) -> str | None:
-    """The same of a document that names its format; None of all others."""
+    """Kind of a document that names its format; None for all others."""
     found = special_kind(data)
     return found if found is not None and " of format " in found else None
 

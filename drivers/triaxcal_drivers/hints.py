@@ -34,7 +34,7 @@ def _compared(known: Iterable[str]) -> list[str]:
 
 
 def clipped(text: object, most: int = LONGEST) -> str:
-    """What somebody wrote, for a message."""
+    """A user's text, shortened for a message."""
     shown = str(text)
     return shown if len(shown) <= most else f"{shown[:most]}…"
 
@@ -49,14 +49,13 @@ EXTRAS = {
     "rosbags": "logs",
     "lz4": "logs",
 }
-"""By the name that is imported."""
+"""Extra of each module, by import name."""
 CALLED = {"can": "python-can", "serial": "pyserial"}
-"""Where the package has another name than what is imported."""
+"""Package names that differ from the import name."""
 
 
 def absent(modules: Iterable[str]) -> str | None:
-    """What to install, of modules by the names that are imported; None where
-    all are there."""
+    """Hint about missing modules (import names); None if all are there."""
     missing = [m for m in modules if importlib.util.find_spec(m) is None]
     if not missing:
         return None
@@ -66,7 +65,7 @@ def absent(modules: Iterable[str]) -> str | None:
 
 
 def lacking(e: ModuleNotFoundError) -> str | None:
-    """What to install; None where it is no package of ours."""
+    """Hint about a missing package; None if it is in no extra of ours."""
     module = (e.name or "").partition(".")[0]
     return _told(module, EXTRAS[module]) if module in EXTRAS else None
 

@@ -7,9 +7,8 @@ import time
 from collections.abc import Callable
 
 STEP_NS = 100_000_000
-"""What the clock moves by between two looks is a step from here on: slewing it
-moves the running clock too, and reading both takes microseconds, on a busy
-machine some milliseconds."""
+"""Smallest change between the clocks that counts as a step: slewing moves both, and
+reading them takes microseconds, on a busy machine some milliseconds."""
 
 STEPS_MOST = 30
 """Steps that are remembered; a clock that makes more has other troubles."""
@@ -22,8 +21,8 @@ def _running_ns() -> int:
 
 
 def slept_ns() -> int:
-    """How long this machine has slept since its start; 0 where the system does
-    not count that."""
+    """Time that this machine has slept since its start [ns]; 0 if the system does not
+    count it."""
     return _running_ns() - time.monotonic_ns() if hasattr(time, "CLOCK_BOOTTIME") else 0
 
 
@@ -73,4 +72,5 @@ class SteadyClock:
 
 
 HOST = SteadyClock()
-"""Of this process: what is opened anew after a step stays on the line."""
+"""The clock of this process: its time continues when a device is opened anew after a
+step."""

@@ -22,7 +22,7 @@ from triaxcal_drivers.two_senders import ExtraAnswer
 
 
 class RawFlag(IntFlag):
-    """What the receiver knew about a raw record besides its bytes."""
+    """Flags of a raw record, set by the receiver."""
 
     EXTENDED_ID = 1
     REMOTE = 2  # of a CAN FD frame, which cannot be remote: its sender was error passive
@@ -39,9 +39,8 @@ EXTENDED_KEY = 1 << 32
 
 
 BUSY_S = 6.0
-"""So long a busy device is waited for: longer than any EEPROM takes, and short
-enough that a provisioning and its undoing, with a reconnection each, end within
-30 s."""
+"""Longest wait for a busy device: longer than any EEPROM takes, and short enough that a
+provisioning and its undo, with a reconnection each, end within 30 s."""
 BUSY_PAUSE_S = 0.02
 
 
@@ -101,8 +100,8 @@ class RawBatch:
         return np.asarray(self.source.astype(np.int64) + extended * EXTENDED_KEY)
 
     def after(self, gap: Gap | None) -> RawBatch:
-        """The same records, with a gap before the first of them; None where
-        that was told before them."""
+        """The same records with a gap before the first; None if the gap was reported
+        before."""
         flags = self.flags.copy()
         flags[:1] |= np.uint8(RawFlag.LOST_BEFORE)
         return replace(self, flags=flags, gap=gap)
@@ -140,7 +139,7 @@ class RawBatch:
 
     @staticmethod
     def of(records: Sequence[tuple[int, int, int, bytes]]) -> RawBatch:
-        """From (time_ns, source, flags, data) records."""
+        """A batch of (time_ns, source, flags, data) records."""
         time_ns, source, flags, data = zip(*records, strict=True) if records else ((), (), (), ())
         return RawBatch(
             np.array(time_ns, dtype=np.int64),
@@ -251,11 +250,11 @@ class Listens(Protocol):
 
 
 class Driver(Protocol):
-    """What an entry point of group ``triaxcal.drivers`` names: a class with
-    these.
+    """The interface of a driver: a class named by an entry point of the group
+    ``triaxcal.drivers``.
 
-    A ``bus_model`` says by a method ``claim`` what one process has for itself
-    while it works with a unit (see `triaxcal_drivers.claim`); without it all
+    A ``bus_model`` states by a method ``claim`` what one process claims while it works
+    with a unit (see `triaxcal_drivers.claim`); without it all
     settings together name the device. A driver may name the ``packages`` that
     it imports only when a device is opened, so that `triaxcal devices` can say
     which are not there. By a method ``loads(bundle, bus)`` it may say what each
@@ -276,10 +275,10 @@ class Driver(Protocol):
 
 @dataclass(frozen=True)
 class LineLoad:
-    """What a unit takes of a line that it shares.
+    """Load of a unit on a shared line.
 
-    ``line`` names what units share, ``settings`` how it is driven, which
-    must be the same for all of them. A unit's stream takes ``reads_per_s``
+    ``line`` is the name of the line, ``settings`` are its settings, which must be
+    equal for all its units. A unit's stream takes ``reads_per_s``
     reads, or frames, each of which keeps the line for ``read_s`` at least.
     """
 

@@ -51,8 +51,8 @@ class RegisterType(Protocol):
 
 
 @dataclass(frozen=True)
-class Whole:
-    """Whole numbers of up to 8 bytes, signed ones in two's complement."""
+class Integer:
+    """Integers of up to 8 bytes, signed ones in two's complement."""
 
     size: int
     signed: bool
@@ -120,14 +120,14 @@ class Floating:
 
 
 TYPES: Mapping[str, RegisterType] = {
-    "int16": Whole(2, signed=True),
-    "uint16": Whole(2, signed=False),
-    "int24": Whole(3, signed=True),
-    "uint24": Whole(3, signed=False),
-    "int32": Whole(4, signed=True),
-    "uint32": Whole(4, signed=False),
-    "int64": Whole(8, signed=True),
-    "uint64": Whole(8, signed=False),
+    "int16": Integer(2, signed=True),
+    "uint16": Integer(2, signed=False),
+    "int24": Integer(3, signed=True),
+    "uint24": Integer(3, signed=False),
+    "int32": Integer(4, signed=True),
+    "uint32": Integer(4, signed=False),
+    "int64": Integer(8, signed=True),
+    "uint64": Integer(8, signed=False),
     "float32": Floating("f", 24),
     "float64": Floating("d", 53),
 }
@@ -142,7 +142,7 @@ def counts(name: str) -> bool:
     """Whether the type can be a counter's or a clock's: it fills registers and
     wraps to zero."""
     type_ = TYPES[name]
-    return in_words(name) and isinstance(type_, Whole) and not type_.signed
+    return in_words(name) and isinstance(type_, Integer) and not type_.signed
 
 
 def next_in_words(name: str) -> str | None:
@@ -243,7 +243,7 @@ def raw_number(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> 
 def holds_integers(register: Format) -> bool:
     """Whether every value of the register is an integer. Floats would round
     those from 2^53 on."""
-    return isinstance(TYPES[register.type], Whole) and register.scale % 1 == 0 and register.offset % 1 == 0
+    return isinstance(TYPES[register.type], Integer) and register.scale % 1 == 0 and register.offset % 1 == 0
 
 
 def _number(register: Format, raw: bytes, order: ByteOrder, name: str) -> float:

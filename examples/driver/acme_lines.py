@@ -7,11 +7,11 @@ from contextlib import closing
 
 import numpy as np
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle, Profile, Strict
+from triaxcal_drivers.stall_clock import StallTolerantClock
 
 
 class LinesStream(Strict):
@@ -93,10 +93,10 @@ class LinesDevice:
         await self.close()  # a new connection has no lines in its buffers
         await self.open()
         rest, wait_s = b"", self._profile.sampling.silence_timeout_s
-        with closing(Attention(asyncio.get_running_loop())) as attention:
+        with closing(StallTolerantClock(asyncio.get_running_loop())) as clock:
             while True:
                 try:
-                    async with attention.timeout(wait_s):
+                    async with clock.timeout(wait_s):
                         data = await self._reader.read(65536)
                 except TimeoutError:
                     raise DeviceSilent(f"no line for {wait_s:g} s") from None

@@ -13,7 +13,7 @@ from tests.conftest import Workshop
 from triaxcal_drivers.modbus.protocol import SerialLine
 from triaxcal_drivers.modbus.stack import serve_serial
 from triaxcald.audit import audit
-from triaxcald.run.line import Outcome, run_station
+from triaxcald.run.unit_run import Outcome, run_station
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.modbus_unit import ModbusMap, pty_pair
 from triaxcald.station.config import check_lines, load_station

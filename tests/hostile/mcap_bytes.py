@@ -8,7 +8,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from triaxcald.recording import schema
-from triaxcald.recording.frames import MAGIC
+from triaxcald.recording.mcap_records import MAGIC
 from triaxcald.recording.schema import SCHEMAS
 
 

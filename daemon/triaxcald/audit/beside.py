@@ -9,8 +9,8 @@ from pathlib import Path
 from triaxcal_drivers.files import open_file
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.outcome import ATTACHMENT, SUFFIX, digest_of
-from triaxcald.recording.frames import ATTACHMENT_LIMIT
-from triaxcald.run.line import CERTIFICATE, REPORT
+from triaxcald.recording.mcap_records import ATTACHMENT_LIMIT
+from triaxcald.run.unit_run import CERTIFICATE, REPORT
 
 NAMES = (CERTIFICATE, REPORT, ATTACHMENT)
 

@@ -42,7 +42,7 @@ from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
-from triaxcald.run.line import CERTIFICATE, REPORT
+from triaxcald.run.unit_run import CERTIFICATE, REPORT
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 from triaxcald.software import drawn_with, software
 

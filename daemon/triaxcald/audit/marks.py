@@ -1,4 +1,4 @@
-"""Writes by which a restart was to show (`triaxcald.provision.proof`), found
+"""Writes by which a restart was to show (`triaxcald.provision.restart_check`), found
 again in the register traffic."""
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from triaxcal_drivers.profile import Profile
-from triaxcald.provision.proof import beside, may_mark, own_steps, writes_of
+from triaxcald.provision.restart_check import may_probe, neighbouring_values, own_steps, writes_of
 from triaxcald.recording.schema import RegisterAccess
 
 
@@ -58,7 +58,7 @@ def marks_in(accesses: Sequence[RegisterAccess], profile: Profile, asked: Collec
     """``asked`` are the values that registers are to hold, or held: none of
     them is one that only shows a restart."""
     found = Marks()
-    if not may_mark(profile):
+    if not may_probe(profile):
         return found
     store, reset = own_steps(profile, "store"), own_steps(profile, "reset")
     lock = writes_of(profile, "lock") - writes_of(profile, "reset")
@@ -121,4 +121,4 @@ def _read(found: Marks, in_use: dict[str, Mark], mark: Mark | None, i: int, a: R
 
 
 def _is_mark(profile: Profile, a: RegisterAccess, held: bytes, asked: Collection[tuple[str, bytes]]) -> bool:
-    return (a.register, a.raw) not in asked and a.raw in beside(profile, a.register, held)
+    return (a.register, a.raw) not in asked and a.raw in neighbouring_values(profile, a.register, held)

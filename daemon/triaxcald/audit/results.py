@@ -27,7 +27,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
-from triaxcald.run.line import CERTIFICATE
+from triaxcald.run.unit_run import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.station.config import StationFile, parse_station
 from triaxcald.verification import (

@@ -16,8 +16,8 @@ from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
 from triaxcald.provision.identity import serial_text
 from triaxcald.provision.power import MISSED
-from triaxcald.provision.proof import SEQUENCES, may_mark, own_steps, writes_of
-from triaxcald.provision.registers import RegisterImage, calibration_registers, doubts
+from triaxcald.provision.registers import RegisterImage, calibration_registers, sanity_warnings
+from triaxcald.provision.restart_check import SEQUENCES, may_probe, own_steps, writes_of
 from triaxcald.provision.sequence import Label
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
@@ -271,7 +271,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
         if said.image and said.earlier is None and not said.forced:
             found += [
                 Difference(ATTACHMENT, Kind.NOT_FORCED, doubt.register)
-                for doubt in doubts(traffic.profile, snapshot.Snapshot(said.before), said.image)
+                for doubt in sanity_warnings(traffic.profile, snapshot.Snapshot(said.before), said.image)
             ]
         if not said.aborted:
             expect("written", list(written), differing)
@@ -385,7 +385,7 @@ def _not_restarted(traffic: Traffic, said: Said) -> bool:
         return True
     if said.rules is Rules.MARK_OR_SUPPLY:
         return not _shown(traffic, said)
-    return not (_shown(traffic, said) if may_mark(traffic.profile) else _acknowledged(traffic))
+    return not (_shown(traffic, said) if may_probe(traffic.profile) else _acknowledged(traffic))
 
 
 def _offered(traffic: Traffic) -> list[Mark]:

@@ -1,5 +1,4 @@
-"""What a person sees: results on standard output, progress and warnings on
-standard error."""
+"""The console: results on standard output, progress and warnings on standard error."""
 
 from __future__ import annotations
 
@@ -76,7 +75,7 @@ class ProgressLine:
             self._shown, self._next_s = self._terminal, now + (BEAT_S if self._terminal else PLAIN_S)
 
     def erase(self) -> None:
-        """Before anything else is written to the terminal."""
+        """Erase the line, before other output to the terminal."""
         with self._lock:
             if self._shown:
                 self._write(ERASE)
@@ -93,7 +92,7 @@ _line: ProgressLine | None = None
 
 @contextmanager
 def telling_progress() -> Iterator[None]:
-    """Of what `at` and `progress` are told inside."""
+    """Shows a progress line, which `at` and `progress` set, within the context."""
     global _line
     ended, line = threading.Event(), ProgressLine(_to_standard_error, terminal=sys.stderr.isatty())
 
@@ -112,13 +111,13 @@ def telling_progress() -> Iterator[None]:
 
 
 def at(what: str, done: float | None = None) -> None:
-    """What the command is at, in words."""
+    """Show the present step of the command."""
     if _line is not None:
         _line.at(what, done)
 
 
 def progress(stage: tc.Stage, done: float | None = None) -> None:
-    """The same of the metrology, as a `triaxcal.progress.Progress`."""
+    """Show the present step of the metrology (a `triaxcal.progress.Progress`)."""
     at(WORDS[stage], done)
 
 
@@ -161,9 +160,8 @@ class Unshown(Exception):
 
 @contextmanager
 def showing(code: int, told: str) -> Iterator[None]:
-    """For what is shown of work that has changed a device: its exit code and
-    what came of it are said, whatever becomes of standard output. Raises
-    Unshown."""
+    """Context of output about work that has changed a device: the exit code and the
+    result are reported even if standard output fails. Raises Unshown."""
     try:
         yield
         sys.stdout.flush()
@@ -188,8 +186,8 @@ def say(text: str) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """To standard output; columns of numbers are the caller's text, and a tuple
-    has a line for each of its texts."""
+    """Print a table to standard output. Numbers are formatted by the caller; each text
+    of a tuple gets a line of its own."""
     erased()
     shown = Table(title=printable(title), title_justify="left", header_style="bold")
     for i, name in enumerate(columns):
@@ -220,8 +218,8 @@ def micro(value: float | None) -> str:
 
 class _Shown(Console):
     def on_broken_pipe(self) -> None:
-        """Nobody looks any more; rich would take standard output away too, and
-        end the program."""
+        """Stop the display after the reader has gone; rich would close standard output
+        too and end the program."""
         self.quiet = True
 
 

@@ -24,14 +24,14 @@ from triaxcald.station.config import Place, Station, load_station
 
 
 def of_a_journal(station: Station, unit: str, serial: str | None) -> str | None:
-    """What there is to warn of, where an earlier provisioning of the unit is
-    not settled."""
+    """Warning about an earlier provisioning of the unit that is not settled; None
+    without one."""
     journal = open_journal(station.folder, station.place(unit).bundle.profile, unit, serial)
     return text.unfinished(journal, unit, station.path) if journal else None
 
 
 def warn_of_a_journal(station: Station, unit: str, serial: str | None) -> None:
-    """To standard error."""
+    """Print the warning of `of_a_journal` to standard error."""
     if warning := of_a_journal(station, unit, serial):
         say(f"warning: unit {unit}: {warning}")
 

@@ -29,7 +29,7 @@ from triaxcald.cli.results import (
     temperature_of,
     text_of_held_out,
 )
-from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling_data_quality, warn
+from triaxcald.cli.showing import FitSettings, fit_settings, judge, read_recording, telling_data_quality, warn
 from triaxcald.cli.syntax import writable
 from triaxcald.documents import rezero_document
 from triaxcald.earlier import EarlierFile
@@ -47,8 +47,7 @@ DEFAULT_SIGNS = (
     "and nothing in the data tells"
 )
 Way = tuple[Measured, tc.interchange.Document, tc.estimate.Calibration, Callable[[], None]]
-"""What was measured, the document, the calibration, and how it is shown at the
-console."""
+"""Measurement, document, calibration, and the function that shows it at the console."""
 
 
 def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | None:
@@ -91,29 +90,29 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
 def _turning(a: argparse.Namespace) -> Way:
     moments = tc.inputs.Moments()
     measured = read_recording(a, a.recording, moments)
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
-        found = tc.inputs.fit_rotation(moments, signs=choice.signs, reference=choice.reference)
+        found = tc.inputs.fit_rotation(moments, signs=settings.signs, reference=settings.reference)
     document = tc.interchange.turning_document(
-        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+        found, output_unit=settings.output_unit, reference_unit=settings.reference_unit
     )
     calibration = found.calibration
     still = [p for p in measured.poses if not p.creep.any()]
     if len(still) >= POSES_ENOUGH:
         advice = f"there are {len(still)} still poses in it: without --turning the fit would use their quiet"
         document["warnings"] = [*document["warnings"], advice]
-    return measured, document, calibration, lambda: _show_turning(found, choice)
+    return measured, document, calibration, lambda: _show_turning(found, settings)
 
 
-def _show_turning(found: tc.inputs.RotationFit, choice: Choice) -> None:
-    show_coefficients(found.calibration, choice)
+def _show_turning(found: tc.inputs.RotationFit, settings: FitSettings) -> None:
+    show_coefficients(found.calibration, settings)
     if t := found.temperature:
         show(held_at(t.mean, t.lowest, t.highest, "samples"))
-    r, small = found.calibration.residual, choice.small
+    r, small = found.calibration.residual, settings.small
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
     show(
         f"{tc.number_format.number_of(found.samples, 'sample')}, whose noise is {noise} "
-        f"{choice.reference_unit} in x, y, z"
+        f"{settings.reference_unit} in x, y, z"
     )
     show(
         f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
@@ -124,7 +123,7 @@ def _show_turning(found: tc.inputs.RotationFit, choice: Choice) -> None:
 def _attitudes(a: argparse.Namespace) -> Way:
     rows = read_attitudes(a.attitudes)
     measured = read_recording(a, a.recording)
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     poses, rows = match(rows, measured.poses, path=a.attitudes, recording=measured.name)
     with telling_data_quality(measured):
         found = tc.inputs.fit_attitudes(
@@ -132,30 +131,30 @@ def _attitudes(a: argparse.Namespace) -> Way:
             np.array([row.up for row in rows]),
             names=[row.name for row in rows],
             signs=a.sign or measured.signs,
-            reference=choice.reference,
+            reference=settings.reference,
             attitude_error_rad=a.attitude_error,
         )
     document = tc.interchange.attitudes_document(
-        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+        found, output_unit=settings.output_unit, reference_unit=settings.reference_unit
     )
-    return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
+    return measured, document, found.calibration, lambda: _show_attitudes(found, settings)
 
 
-def _show_attitudes(found: tc.inputs.AttitudeFit, choice: Choice) -> None:
+def _show_attitudes(found: tc.inputs.AttitudeFit, settings: FitSettings) -> None:
     c = found.calibration
-    show_coefficients(c, choice)
+    show_coefficients(c, settings)
     if said := temperature_of(c):
         show(said)
     table(
         "attitudes",
-        ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.small}", "used"],
+        ["", "start s", "off µrad", "off, standard errors", f"|a| off {settings.small}", "used"],
         [
             [
                 row.name,
                 f"{pose.pose.start_s:.1f}",
                 micro(row.off_rad),
                 f"{row.off:.1f}",
-                choice.small.written(pose.residual_g),
+                settings.small.written(pose.residual_g),
                 "yes" if pose.used else "no",
             ]
             for row, pose in zip(found.attitudes, c.poses, strict=True)
@@ -175,7 +174,7 @@ def _show_attitudes(found: tc.inputs.AttitudeFit, choice: Choice) -> None:
         f"error of the attitudes by axis: {micro(found.attitude_error_rad)} µrad ({how}); with what residuals say it "
         f"raises the standard errors by a factor of up to {cost:.2f}"
     )
-    small = choice.small
+    small = settings.small
     r = c.residual
     show(
         f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, {cross_validated(r, small)}, noise floor "
@@ -187,25 +186,25 @@ def _datasheet(a: argparse.Namespace) -> Way:
     held = read_document(a.datasheet)
     measured = read_recording(a, a.recording)
     require_unit(held, measured, where=a.datasheet)
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     said = a.reference or measured.reference or getattr(a, "latitude", None)
     datasheet, units = read_datasheet(
-        held, where=a.datasheet, errors=a.datasheet_error, reference=choice.reference if said is not None else None
+        held, where=a.datasheet, errors=a.datasheet_error, reference=settings.reference if said is not None else None
     )
     if a.sign and any(k * s < 0 for k, s in zip(datasheet.sensor.scale_factor, a.sign, strict=True)):
         raise InputError(f"--sign: the scale factors in {a.datasheet} have other signs")
-    choice = replace(
-        choice,
+    settings = replace(
+        settings,
         reference=datasheet.reference,
-        output_unit=choice.output_unit or units.get("output", ""),
-        reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
+        output_unit=settings.output_unit or units.get("output", ""),
+        reference_unit=a.reference_unit or units.get("reference") or settings.reference_unit,
     )
     with telling_data_quality(measured), np.errstate(all="ignore"):  # numbers out of a file may be any
         found = tc.inputs.refine(measured.poses, datasheet)
     document = tc.interchange.datasheet_document(
-        found, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+        found, output_unit=settings.output_unit, reference_unit=settings.reference_unit
     )
-    return measured, document, found.calibration, lambda: _show_datasheet(found, choice)
+    return measured, document, found.calibration, lambda: _show_datasheet(found, settings)
 
 
 def read_datasheet(
@@ -244,7 +243,7 @@ def read_datasheet(
     ), held
 
 
-def _show_datasheet(found: tc.inputs.Refinement, choice: Choice) -> None:
+def _show_datasheet(found: tc.inputs.Refinement, settings: FitSettings) -> None:
     c = found.calibration
     table(
         f"datasheet values, refined by {len(c.poses)} poses",
@@ -264,7 +263,7 @@ def _show_datasheet(found: tc.inputs.Refinement, choice: Choice) -> None:
             )
         ],
     )
-    r, small = c.residual, choice.small
+    r, small = c.residual, settings.small
     show(
         f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; datasheet and poses "
         f"agree with p {tc.number_format.probability(found.conflict_p)}"
@@ -279,7 +278,7 @@ COLUMNS = {
     "one value": "probability that its coefficients are the same in all, if it does",
     "in each unit by itself": "probability that it acts there, by that unit alone, in the order of the recordings",
 }
-"""What stands in the table of all units."""
+"""Columns of the table of all units."""
 
 
 def measured_each(a: argparse.Namespace) -> list[Measured]:
@@ -311,8 +310,7 @@ def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None
 
 
 def _place(name: str) -> Path | None:
-    """Where a recording lies, however its path is written; None for standard
-    input."""
+    """Resolved path of a recording; None for standard input."""
     return None if name == "-" else Path(name).resolve()
 
 
@@ -336,13 +334,13 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
 
 
 def named_quality(m: Measured) -> list[str]:
-    """Its data quality, where that stands beside another recording's."""
+    """Data quality with the name of the recording, for several recordings."""
     return [f"{m.name}: {line}" for line in m.data_quality]
 
 
 def _require_alike(first: Measured, other: Measured, a: argparse.Namespace, *, hint: str = "") -> None:
     """``hint`` is for recordings of two units."""
-    ours, theirs = ({"unit": _serial(m), **_settings(chosen(a, m))} for m in (first, other))
+    ours, theirs = ({"unit": _serial(m), **_document_settings(fit_settings(a, m))} for m in (first, other))
     for what, said in theirs.items():
         if said != ours[what] and not (what == "unit" and None in (said, ours[what])):
             more = hint if what == "unit" else f"; {_SAID_BY[what]} says it for all"
@@ -362,15 +360,15 @@ def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
     return out
 
 
-def doubts_of_one_unit(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
+def unit_identity_warnings(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, settings: FitSettings) -> list[str]:
     """Lines where several recordings can hardly be of one unit; ``loop`` is
     that of all of them."""
     if len(recordings) == 1:
         return []
     names = " and ".join(m.name for m in recordings)
-    if said := unlike(names, loop.before.residual.rms_g, choice.reference, "do not look like one unit"):
+    if said := unlike(names, loop.before.residual.rms_g, settings.reference, "do not look like one unit"):
         return said
-    shapes = [(m.name, tc.estimate.shape_by_poses(m.poses, choice.signs, choice.reference)) for m in recordings]
+    shapes = [(m.name, tc.estimate.shape_by_poses(m.poses, settings.signs, settings.reference)) for m in recordings]
     known = [(name, shape) for name, shape in shapes if shape is not None]
     return [
         line
@@ -379,13 +377,15 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: tc.diagnosis.Loop, 
     ]
 
 
-def doubts_of_check(measured: Measured, check: Measured, loop: tc.diagnosis.Loop, choice: Choice) -> list[str]:
+def check_identity_warnings(
+    measured: Measured, check: Measured, loop: tc.diagnosis.Loop, settings: FitSettings
+) -> list[str]:
     """A line where the held-out poses can hardly be of the unit of those
     diagnosed in ``loop``."""
     assert loop.held_out is not None
-    if said := unlike(check.name, loop.held_out.before_rms_g, choice.reference):
+    if said := unlike(check.name, loop.held_out.before_rms_g, settings.reference):
         return said
-    own = tc.estimate.shape_by_poses(check.poses, choice.signs, choice.reference)
+    own = tc.estimate.shape_by_poses(check.poses, settings.signs, settings.reference)
     return tc.text.pooled_units.other_unit(measured.name, check.name, tc.estimate.shape_of(loop.before), own)
 
 
@@ -401,16 +401,16 @@ _SAID_BY = {
 """The options by which a setting is the same for all recordings."""
 
 
-def _settings(choice: Choice) -> dict[str, str | None]:
+def _document_settings(settings: FitSettings) -> dict[str, str | None]:
     return {
-        "signs of the scale factors": ",".join("+" if s > 0 else "-" for s in choice.signs),
-        "reference": f"{choice.reference:g} {choice.reference_unit}",
-        "output unit": choice.output_unit or "not stated",
+        "signs of the scale factors": ",".join("+" if s > 0 else "-" for s in settings.signs),
+        "reference": f"{settings.reference:g} {settings.reference_unit}",
+        "output unit": settings.output_unit or "not stated",
     }
 
 
-def show_by_recording(loop: tc.diagnosis.Loop, names: Sequence[str], choice: Choice) -> None:
-    small = choice.small
+def show_by_recording(loop: tc.diagnosis.Loop, names: Sequence[str], settings: FitSettings) -> None:
+    small = settings.small
     table(
         f"by recording, {small} rms",
         ["", "poses", "before", "after", "noise floor"],
@@ -425,9 +425,9 @@ def show_agreement(
     found: tc.pooled_units.PooledAnalysis,
     names: Sequence[str],
     loops: Sequence[tc.diagnosis.Loop],
-    choices: Sequence[Choice],
+    settings_of_each: Sequence[FitSettings],
 ) -> None:
-    small = choices[0].small
+    small = settings_of_each[0].small
     table(
         f"each unit by itself, {small}",
         ["", "finding", "probability", "or instead", "residual before", "after", "noise floor"],
@@ -480,19 +480,19 @@ def fit_command(a: argparse.Namespace) -> int:
     if way is not None:
         return _fit_by(way, a)
     measured = read_recording(a, a.recording)
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         progress(tc.Stage.FIT)
-        calibration = tc.estimate.fit(measured.poses, signs=choice.signs, reference=choice.reference)
+        calibration = tc.estimate.fit(measured.poses, signs=settings.signs, reference=settings.reference)
     document = tc.interchange.calibration_document(
-        calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
+        calibration, output_unit=settings.output_unit, reference_unit=settings.reference_unit, stated=settings.stated
     )
     document["data_quality"] = measured.data_quality
     write_results(a, measured, document)
     if a.json:
         emit(document)
     else:
-        show_calibration(calibration, choice)
+        show_calibration(calibration, settings)
         warn([*map(tc.text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, calibration.residual.rms_g, calibration.reference)
 
@@ -521,14 +521,14 @@ def diagnose_command(a: argparse.Namespace) -> int:
     names = [m.name for m in recordings]
     measured = as_one_unit(recordings, a)
     check = measured_check(measured, a)
-    choice = chosen(a, measured)
-    loop = _loop(a, measured, choice, check.poses if check else None)
-    remarks, doubts = channels_of_some(recordings), doubts_of_one_unit(recordings, loop, choice)
+    settings = fit_settings(a, measured)
+    loop = _loop(a, measured, settings, check.poses if check else None)
+    remarks, doubts = channels_of_some(recordings), unit_identity_warnings(recordings, loop, settings)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
-        doubts += doubts_of_check(measured, check, loop, choice)
+        doubts += check_identity_warnings(measured, check, loop, settings)
     progress(tc.Stage.ADVICE)
-    document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
+    document = _loop_document(loop, measured, settings, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:
         document = tc.interchange.with_recordings(document, loop, names)
     write_results(a, measured, document)
@@ -537,24 +537,24 @@ def diagnose_command(a: argparse.Namespace) -> int:
     else:
         show_summary(document["summary"])
         if len(names) > 1:
-            show_by_recording(loop, names, choice)
+            show_by_recording(loop, names, settings)
         if a.verbose:
-            show_loop(loop, choice)
-            show_calibration(loop.after, choice)
+            show_loop(loop, settings)
+            show_calibration(loop.after, settings)
         elif loop.held_out:
-            show(text_of_held_out(loop.held_out, choice.small))
+            show(text_of_held_out(loop.held_out, settings.small))
         warn([*document["calibration"]["warnings"], *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, loop.after.residual.rms_g, loop.after.reference)
 
 
 def _loop(
-    a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[tc.Pose] | None = None
+    a: argparse.Namespace, measured: Measured, settings: FitSettings, check: Sequence[tc.Pose] | None = None
 ) -> tc.diagnosis.Loop:
     with telling_data_quality(measured), telling_default_signs(a, measured):
         return tc.diagnosis.diagnose(
             measured.poses,
-            signs=choice.signs,
-            reference=choice.reference,
+            signs=settings.signs,
+            reference=settings.reference,
             check=check,
             at=a.at if a.at is not None else measured.holds_at or tc.Moment.END,
             progress=progress,
@@ -564,7 +564,7 @@ def _loop(
 def _loop_document(
     loop: tc.diagnosis.Loop,
     measured: Measured,
-    choice: Choice,
+    settings: FitSettings,
     remarks: Sequence[str] = (),
     *,
     unit_in_doubt: bool = False,
@@ -572,9 +572,9 @@ def _loop_document(
     return documents.loop_document(
         loop,
         data_quality=measured.data_quality,
-        output_unit=choice.output_unit,
-        reference_unit=choice.reference_unit,
-        stated=choice.stated,
+        output_unit=settings.output_unit,
+        reference_unit=settings.reference_unit,
+        stated=settings.stated,
         remarks=remarks,
         unit_in_doubt=unit_in_doubt,
     )
@@ -589,26 +589,26 @@ def _require_alone(a: argparse.Namespace) -> None:
 
 
 def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> int:
-    names, choices = [m.name for m in recordings], [chosen(a, m) for m in recordings]
+    names, settings_of_each = [m.name for m in recordings], [fit_settings(a, m) for m in recordings]
     loops = []
-    for measured, choice in zip(recordings, choices, strict=True):
+    for measured, settings in zip(recordings, settings_of_each, strict=True):
         try:
-            loops.append(_loop(a, replace(measured, data_quality=named_quality(measured)), choice))
+            loops.append(_loop(a, replace(measured, data_quality=named_quality(measured)), settings))
         except tc.Refused as e:
             raise tc.Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
     found = tc.pooled_units.pooled_analysis(loops)
     results = []
-    for loop, measured, choice in zip(loops, recordings, choices, strict=True):
+    for loop, measured, settings in zip(loops, recordings, settings_of_each, strict=True):
         results.append(
-            _loop_document(loop, measured, choice) | ({"unit": dict(measured.unit)} if measured.unit else {})
+            _loop_document(loop, measured, settings) | ({"unit": dict(measured.unit)} if measured.unit else {})
         )
-    document = tc.interchange.agreement_document(found, names, results, choices[0].reference_unit)
+    document = tc.interchange.agreement_document(found, names, results, settings_of_each[0].reference_unit)
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.json:
         emit(document)
     else:
-        show_agreement(found, names, loops, choices)
+        show_agreement(found, names, loops, settings_of_each)
         for measured, loop in zip(recordings, loops, strict=True):
             warnings = map(tc.text.caution, loop.after.cautions)
             warn([*(f"{measured.name}: {line}" for line in warnings), *named_quality(measured)])
@@ -632,14 +632,14 @@ def write_results(
         write_text(a.output, documents.to_text(document))
     if a.report:
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
-        unit = chosen(a, measured).output_unit
+        unit = fit_settings(a, measured).output_unit
         overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None
         page = render_report(shown or document, title=title_of(measured.name), stream=overview, certificate=limits)
         write_text(a.report, page)
 
 
 def title_of(name: str) -> str:
-    """Of a report: the file's name, wherever it lies."""
+    """Title of a report: the name of the file without its folder."""
     return "standard input" if name == "-" else Path(name).name
 
 
@@ -652,7 +652,7 @@ def rezero_command(a: argparse.Namespace) -> int:
     file = EarlierFile.read(a.calibration)
     earlier = file.calibration
     measured = read_recording(a, a.recording, wanted_by=earlier)
-    said = chosen(a, measured)
+    said = fit_settings(a, measured)
     file.require_of(
         measured.name,
         serial=(measured.unit or {}).get("serial"),
@@ -661,7 +661,7 @@ def rezero_command(a: argparse.Namespace) -> int:
         reference_unit=a.reference_unit,
         output_unit=said.output_unit,
     )
-    choice = replace(
+    settings = replace(
         said,
         reference=earlier.fitted.reference,
         output_unit=said.output_unit or earlier.output_unit,
@@ -672,9 +672,9 @@ def rezero_command(a: argparse.Namespace) -> int:
     loop = rezero_document(
         found,
         data_quality=measured.data_quality,
-        output_unit=choice.output_unit,
-        reference_unit=choice.reference_unit,
-        stated=choice.stated,
+        output_unit=settings.output_unit,
+        reference_unit=settings.reference_unit,
+        stated=settings.stated,
     )
     document = loop["calibration"] | {"data_quality": measured.data_quality}
     if file.serial:
@@ -683,17 +683,17 @@ def rezero_command(a: argparse.Namespace) -> int:
     if a.json:
         emit(document)
     else:
-        _show(found, choice)
+        _show(found, settings)
         warn([*map(tc.text.caution, found.cautions), *measured.data_quality])
     if a.poses is not None and len(found.poses) < a.poses:
         warn([f"--poses {a.poses}: {measured.name} has {len(found.poses)} distinct poses"])
     return judge(a.limit, found.residual.rms_g, found.reference)
 
 
-def _show(found: tc.estimate.Calibration, choice: Choice) -> None:
-    b = tc.uncertainty.budget(found, choice.stated)
-    show_coefficients(found, choice, b.parameters)
+def _show(found: tc.estimate.Calibration, settings: FitSettings) -> None:
+    b = tc.uncertainty.budget(found, settings.stated)
+    show_coefficients(found, settings, b.parameters)
     assert found.update is not None
-    for line in tc.text.bias_update.lines(found, found.update, choice.small):
+    for line in tc.text.bias_update.lines(found, found.update, settings.small):
         show(line)
-    show_budget(b, choice)
+    show_budget(b, settings)

@@ -15,7 +15,7 @@ import numpy as np
 import triaxcal as tc
 from triaxcald import documents
 from triaxcald.cli.console import emit, say, show, table
-from triaxcald.cli.showing import chosen, read_recording, telling_data_quality, warn
+from triaxcald.cli.showing import fit_settings, read_recording, telling_data_quality, warn
 from triaxcald.cli.syntax import writable
 from triaxcald.errors import DONE, OUTSIDE, InputError
 from triaxcald.files import write_text
@@ -113,9 +113,11 @@ def _placed(
     given: Labels | None,
     assumed: tc.frames.Assumed,
 ) -> tuple[Source, tc.frames.Standing]:
-    """On a level table a turn and a knock look the same but for their length.
-    Labels, where they count the poses, say how many of the longest were
-    turns."""
+    """Poses of a recording, split at half turns.
+
+    On a level table a turn and a knock differ in their length alone. If labels state
+    the number of poses, that many of the longest disturbances were turns.
+    """
     measured = read_recording(a, name, turn_s=tc.poses.TURN_S)
     with telling_data_quality(measured):
         source = _source(a, measured, name, calibration, taken)
@@ -131,8 +133,8 @@ def _placed(
 
 
 def _lengths(measured: Measured) -> list[float]:
-    """How long disturbances lasted that left the readings as they were, the
-    longest first."""
+    """Durations of the disturbances that did not change the readings, the longest
+    first."""
     if measured.windows is None:
         return []
     found = {span.since_s for span in tc.poses.find_spans(measured.windows, turn_s=0.0)}
@@ -140,15 +142,15 @@ def _lengths(measured: Measured) -> list[float]:
 
 
 def _source(a: argparse.Namespace, measured: Measured, name: str, calibration: str, taken: Sequence[str]) -> Source:
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     unit = measured.unit or {}
     called = unit.get("serial") or re.sub(r"(\.csv\.gz|\.csv|\.mcap)$", "", Path(name).name)
     if called in taken:
         called = next(f"{called} ({n})" for n in range(2, len(taken) + 3) if f"{called} ({n})" not in taken)
     if calibration == OWN:
-        fitted = tc.estimate.fit(measured.poses, signs=choice.signs, reference=choice.reference)
+        fitted = tc.estimate.fit(measured.poses, signs=settings.signs, reference=settings.reference)
         return own_source(
-            called, measured, fitted, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+            called, measured, fitted, output_unit=settings.output_unit, reference_unit=settings.reference_unit
         )
     document = read_document(calibration)
     sensor, _, reference = tc.interchange.sensor_of(document, where=calibration)
@@ -166,7 +168,7 @@ def _source(a: argparse.Namespace, measured: Measured, name: str, calibration: s
         measured,
         document,
         where=calibration,
-        output_unit=choice.output_unit,
+        output_unit=settings.output_unit,
         reference_unit=a.reference_unit or tc.units.reference_unit_of(reference),
     )
 

@@ -65,8 +65,8 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: C
 
 
 def _told(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Of an error in a callback, which nobody waits for: in one line where
-    memory ran out."""
+    """Report an error in a callback, which no task awaits; a lack of memory in one
+    line."""
     error = context.get("exception")
     if isinstance(error, BaseException) and ran_out_of_memory(error):
         say(f"triaxcal: {out_of_memory(error)}")
@@ -125,8 +125,8 @@ def _woken_by_itself(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
 
 
 def _notes(e: BaseException | None) -> tuple[str, ...]:
-    """Of the exception and of those that it took the place of: a second
-    cancellation replaces the first."""
+    """Notes of the exception and of those that it replaced: a second cancellation
+    replaces the first."""
     notes: dict[str, None] = {}
     while e is not None:
         notes |= dict.fromkeys(getattr(e, "__notes__", ()))

@@ -10,7 +10,7 @@ import numpy as np
 
 import triaxcal as tc
 from triaxcald.cli.console import emit, say, show, table
-from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
+from triaxcald.cli.showing import counted, fit_settings, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
 
 POSES_MOST, POSES_MOST_FOR = 1000, 200
@@ -205,10 +205,10 @@ def _never_seen(document: tc.interchange.Document) -> list[str]:
 
 def _plan_for_recording(a: argparse.Namespace, effects: Sequence[tc.effects.Effect]) -> int:
     measured = read_recording(a, a.recording)
-    choice = chosen(a, measured)
+    settings = fit_settings(a, measured)
     existing = [p for p in measured.poses if not p.fault]
     with telling_data_quality(measured):
-        found = tc.planning.missing_poses(existing, effects, signs=choice.signs, reference=choice.reference)
+        found = tc.planning.missing_poses(existing, effects, signs=settings.signs, reference=settings.reference)
     observabilities = (
         None
         if found.existing is None
@@ -275,13 +275,13 @@ def _added(found: tc.planning.MissingPoses, pose: tc.planning.Addition) -> tc.in
 def _of_all(
     effects: Sequence[tc.effects.Effect], errors: Mapping[str, Mapping[str, float | None]]
 ) -> dict[str, Mapping[str, float | None]]:
-    """With the effects for which the recording has no channel."""
+    """Errors by effect, with those effects for which the recording has no channel."""
     return {e.name: errors.get(e.name) or dict.fromkeys(c.name for c in e.coefficients) for e in effects}
 
 
 def _not_shown(found: tc.planning.MissingPoses, effects: Sequence[tc.effects.Effect]) -> dict[str, str]:
-    """In words, by effect: what of it the poses there cannot show, and whether
-    the poses to add do."""
+    """Text by effect: its part that the existing poses cannot show, and whether the
+    added poses show it."""
     out = {}
     for effect in effects:
         lost = [n for n in effect.needs if n in found.absent]

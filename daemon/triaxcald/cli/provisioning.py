@@ -10,10 +10,10 @@ from typing import Any
 import triaxcal as tc
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
+from triaxcald.caveats import is_passing
 from triaxcald.certificate import held_by_device, image_of, why_not_written
 from triaxcald.cli.console import emit, say, show, showing, table
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.doubts import is_passing
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
@@ -43,12 +43,11 @@ def provision_command(a: argparse.Namespace) -> int:
 
 
 def _told(done: Provisioned, station: Path) -> str:
-    """What came of it, and what would settle it; nothing where the error said
-    so."""
+    """Result and recovery command; empty if the error has them already."""
     p = done.provisioning
     if p is None or done.error is not None:
         return ""
-    return "; ".join(filter(None, [done.document["reason"], text.settling(p, station)]))
+    return "; ".join(filter(None, [done.document["reason"], text.recovery_command(p, station)]))
 
 
 def _ask(what: str) -> None:
@@ -95,11 +94,11 @@ def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> N
         columns.remove("after")
     rows = [[word[column] for column in columns] for word in _words(p)]
     table(f"unit {place.unit.name}, serial {p.identity.serial}", columns, rows)
-    for doubt in p.doubts:
-        say(f"warning: {text.doubt(doubt)}")
+    for warning in p.warnings:
+        say(f"warning: {text.sanity_warning(warning)}")
     show(done.document["reason"])
-    if settling := text.settling(p, station):
-        show(settling)
+    if recovery_command := text.recovery_command(p, station):
+        show(recovery_command)
     if done.path is not None:
         show(f"outcome {done.path}")
 

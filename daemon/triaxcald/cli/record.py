@@ -72,8 +72,8 @@ class JsonLines:
 
 
 AGAIN_S = 60.0
-"""What a full disk ended begins again so often while others go on: it may have
-been cleared meanwhile."""
+"""Period in which a recording that a full disk ended is tried again while others go
+on."""
 
 
 GARBAGE_LEAST = 10_000
@@ -83,7 +83,7 @@ several times a second on a busy bus, hardly ever with a cycle among them."""
 
 @dataclass(frozen=True)
 class _Chosen:
-    """What is to be recorded of a station."""
+    """Units and buses of a station that are to be recorded."""
 
     station: Station
     places: Sequence[Place]
@@ -122,8 +122,7 @@ def _recorded(a: argparse.Namespace) -> int:
 
 @contextmanager
 def _little_garbage() -> Iterator[None]:
-    """What has been imported is not looked through for garbage, and the rest
-    seldom."""
+    """Reduce garbage collection: never of imported modules, seldom of the rest."""
     thresholds = gc.get_threshold()
     gc.freeze()
     gc.set_threshold(GARBAGE_LEAST, *thresholds[1:])
@@ -147,10 +146,12 @@ async def _record(
 ) -> list[Kept]:
     from triaxcald.run.recording import Roster, State
     from triaxcald.service.supervisor import Supervisor
-    from triaxcald.station.coming_back import Patience
     from triaxcald.station.config import SerialsSeen
+    from triaxcald.station.reconnect import RetryPolicy
 
-    roster = Roster(a.seconds, Patience(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress))
+    roster = Roster(
+        a.seconds, RetryPolicy(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress)
+    )
     serials = SerialsSeen()
 
     def in_a_line() -> str:
@@ -237,7 +238,7 @@ def _recordings(
     serials: SerialsSeen,
     at_work: Collection[str] = (),
 ) -> list[AtRecording]:
-    """Of all that is not ``at_work``."""
+    """Recordings of all units and buses that are not ``at_work``."""
     chosen = chosen.without(at_work)
     return [
         *_of_units(a, chosen.station, chosen.places, progress, serials),
@@ -290,7 +291,7 @@ def _of_buses(
 
 
 def _segments(a: argparse.Namespace) -> Segments | None:
-    """Where anything about them was said."""
+    """Segments by the options; None without any of these."""
     from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
     from triaxcald.run.session import Segments
 
@@ -303,7 +304,7 @@ def _segments(a: argparse.Namespace) -> Segments | None:
 def _of_station(
     station: Station, name: str | None, output: Path, folder: bool
 ) -> tuple[Sequence[Place], Sequence[BusPlace]]:
-    """What is to be recorded. Raises InputError."""
+    """Units and buses to record. Raises InputError."""
     units, buses = [p.unit.name for p in station.places], [b.name for b in station.buses]
     if name is None:
         if not folder and len(units) + len(buses) > 1:

@@ -21,7 +21,7 @@ from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file, require_new, require_recording
-from triaxcald.imports import text
+from triaxcald.imports import notices
 from triaxcald.imports.of_recording import is_own, own_log
 from triaxcald.inputs import bundle_of, losses_of, samples_of
 from triaxcald.recording.contents import Contents
@@ -67,7 +67,7 @@ def info_command(a: argparse.Namespace) -> int:
 
 
 def _samples(path: Path, phases: Iterable[str]) -> dict[str, Any]:
-    """As `samples_of`; where the profile cannot be used, the ``fault``."""
+    """`samples_of`, or the ``fault`` of an unusable profile."""
     try:
         with open_recording(path, unfinished=True) as recording:
             return samples_of(recording, phases)
@@ -172,11 +172,11 @@ def import_command(a: argparse.Namespace) -> int:
             from triaxcald.imports.of_mcap import import_mcap
 
             made = import_mcap(log, bundle, a.output, channel=a.channel)
-    for line in (text.left_out(made.document), *text.remarks(made.document, made.seconds)):
+    for line in (notices.left_out(made.document), *notices.remarks(made.document, made.seconds)):
         if line:
             say(line)
     if a.json:
         emit({"format": "triaxcal.import/1", "output": str(a.output), "duration_s": made.seconds, **made.document})
     else:
-        show(text.summary(a.output, made.document, made.seconds))
+        show(notices.summary(a.output, made.document, made.seconds))
     return 0

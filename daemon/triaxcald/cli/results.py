@@ -1,4 +1,4 @@
-"""What a fit and a diagnosis found, as a person reads it at the console."""
+"""Results of a fit and a diagnosis, for the console."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 import triaxcal as tc
+from triaxcald.caveats import assumption
 from triaxcald.cli.console import show, table
-from triaxcald.cli.showing import Choice, counted
-from triaxcald.doubts import assumption
+from triaxcald.cli.showing import FitSettings, counted
 
 WIDTH = 80
 WORTH_A_LINE = 0.01
 """Effects of less probability are in the document alone."""
 
 
-def show_calibration(c: tc.estimate.Calibration, choice: Choice) -> None:
-    b = tc.uncertainty.budget(c, choice.stated)
-    show_coefficients(c, choice, b.parameters)
+def show_calibration(c: tc.estimate.Calibration, settings: FitSettings) -> None:
+    b = tc.uncertainty.budget(c, settings.stated)
+    show_coefficients(c, settings, b.parameters)
     if said := temperature_of(c):
         show(said)
-    r, small = c.residual, choice.small
+    r, small = c.residual, settings.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
     show(
         f"{poses}: {cross_validated(r, small)}, {weighted(r)}residual rms {small.in_full(r.rms_g)}, noise floor "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {tc.number_format.probability(r.lack_of_fit_p)}"
     )
-    show_budget(b, choice)
+    show_budget(b, settings)
 
 
 def cross_validated(r: tc.estimate.Residual, small: tc.units.ErrorUnit) -> str:
@@ -44,8 +44,8 @@ def weighted(r: tc.estimate.Residual) -> str:
 
 
 def temperature_of(c: tc.estimate.Calibration) -> str:
-    """Where the values of a model without temperature are known to hold; empty
-    for any other."""
+    """Temperature for which the values of a model without temperature hold; empty for
+    other models."""
     of_poses = [p.pose.channels.get(tc.effects.TEMPERATURE, math.nan) for p in c.poses if p.used]
     modelled = any(tc.effects.TEMPERATURE in effect.needs for effect, _ in c.sensor.effects)
     if modelled or not of_poses or not all(map(math.isfinite, of_poses)):
@@ -54,19 +54,21 @@ def temperature_of(c: tc.estimate.Calibration) -> str:
 
 
 def held_at(mean: float, lowest: float, highest: float, of: str) -> str:
-    """At which temperature the values hold, the mean over the poses or samples
-    ``of`` the fit."""
+    """Sentence about the temperature for which the values hold: the mean over the poses
+    or samples ``of`` the fit."""
     low, middle, high = (f"{v:.4g}" for v in (lowest, mean, highest))
     spread = "" if low == high else f", the mean of the {of} ({low} to {high} °C)"
     return f"scale factor, misalignment and bias are those at {tc.effects.TEMPERATURE} = {middle} °C{spread}"
 
 
-def show_coefficients(c: tc.estimate.Calibration, choice: Choice, whole: tc.uncertainty.Combined | None = None) -> None:
+def show_coefficients(
+    c: tc.estimate.Calibration, settings: FitSettings, whole: tc.uncertainty.Combined | None = None
+) -> None:
     """``whole`` is their uncertainty with all that the budget has, where there
     is one."""
     rows = []
-    unit = choice.reference_unit
-    of_scale = f"{choice.output_unit or 'output'}/{tc.units.grouped(unit)}"
+    unit = settings.reference_unit
+    of_scale = f"{settings.output_unit or 'output'}/{tc.units.grouped(unit)}"
     units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
     of_effects = {
         f"{e.name}.{k.name}": tc.units.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
@@ -95,8 +97,8 @@ def _percent(share: float) -> str:
     return "< 1%" if 0 < share < 0.01 else f"{share:.0%}"
 
 
-def show_budget(b: tc.uncertainty.Budget, choice: Choice) -> None:
-    small = choice.small
+def show_budget(b: tc.uncertainty.Budget, settings: FitSettings) -> None:
+    small = settings.small
     rows = [
         [line.source, line.evaluation, small.written(line.magnitude), _percent(b.share(line))] for line in b.components
     ]
@@ -108,7 +110,7 @@ def show_budget(b: tc.uncertainty.Budget, choice: Choice) -> None:
     table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
     by = tc.text.remedy(b.dominant.halved_by, small.figure)
     show(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
-    if assumed := assumption(tc.interchange.assumed_in(b.dominant.basis), choice.reference_unit):
+    if assumed := assumption(tc.interchange.assumed_in(b.dominant.basis), settings.reference_unit):
         show(f"{b.dominant.source}: {assumed}")
     for source in b.not_evaluated:
         show(f"not evaluated: {tc.text.not_evaluated(source, small.figure)}")
@@ -131,9 +133,9 @@ def chance_of(probability: float | None) -> str:
     return "likely, not calibrated" if probability is None else tc.text.diagnosis.chance(probability)
 
 
-def show_loop(loop: tc.diagnosis.Loop, choice: Choice) -> None:
+def show_loop(loop: tc.diagnosis.Loop, settings: FitSettings) -> None:
     """Errors, what acts with which probability, and the advice in full."""
-    show_before_after(loop, choice.small)
+    show_before_after(loop, settings.small)
     told = loop.stated
     likely = [[name, chance_of(told[name])] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", tc.text.diagnosis.chance(loop.found.nothing)]]
@@ -141,9 +143,9 @@ def show_loop(loop: tc.diagnosis.Loop, choice: Choice) -> None:
     table("what acts", ["", "probability"], [*likely, *rest])
     for finding in loop.findings:
         show(f"{finding.verdict}: {finding.effect} ({tc.text.diagnosis.reason(finding, loop.refusal)})")
-    for line in tc.text.diagnosis.advice(loop, choice.small):
+    for line in tc.text.diagnosis.advice(loop, settings.small):
         show(f"to do: {line}")
-    for line in tc.text.diagnosis.notes(loop, choice.small):
+    for line in tc.text.diagnosis.notes(loop, settings.small):
         show(f"note: {line}")
 
 

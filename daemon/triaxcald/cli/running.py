@@ -73,6 +73,6 @@ def not_written(e: OSError, code: int, told: str = "") -> int:
 
 
 def _drop_output() -> None:
-    """What is still in the buffer, so that the interpreter does not stumble
-    over it at its end."""
+    """Redirect the rest of the buffer, so that the interpreter does not fail on it at
+    its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

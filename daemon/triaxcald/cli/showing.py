@@ -17,9 +17,9 @@ from triaxcald.tables.samples import Reading
 
 
 @dataclass(frozen=True)
-class Choice:
-    """How a recording is to be read: the user's word, else the recording's own,
-    else the default."""
+class FitSettings:
+    """Signs, reference and units of a fit: from the options, else from the recording,
+    else the defaults."""
 
     signs: tuple[int, int, int]
     reference: float
@@ -60,8 +60,8 @@ def read_recording(
 
 
 def reading_of(a: argparse.Namespace, name: str, of: tc.Calibration | None = None) -> Reading:
-    """How a table is to be read, where ``of`` is the calibration that needs its
-    channels. Raises InputError where the recording is none."""
+    """Settings for reading a table; ``of`` is the calibration that needs its channels.
+    Raises InputError for settings with a recording."""
     said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
     if is_recording(name) and said != Reading():
         raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
@@ -70,9 +70,9 @@ def reading_of(a: argparse.Namespace, name: str, of: tc.Calibration | None = Non
     )
 
 
-def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
-    """Raises InputError where what was said of the reference does not go
-    together."""
+def fit_settings(a: argparse.Namespace, measured: Measured) -> FitSettings:
+    """The settings of a fit. Raises InputError if options about the reference
+    contradict each other."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     if (latitude is None) != (height is None):
         raise InputError("--latitude, --height: give both, or neither")
@@ -82,7 +82,7 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
         raise InputError(f"--reference-unit {a.reference_unit}: --latitude and --height give the reference in g")
     local = None if latitude is None or height is None else tc.local_gravity_g(latitude, height)[0]
     reference = a.reference or local or measured.reference or 1.0
-    return Choice(
+    return FitSettings(
         a.sign or measured.signs or (1, 1, 1),
         reference,
         a.output_unit or (measured.profile.output.unit if measured.profile else measured.output_unit),
@@ -92,8 +92,8 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
 
 
 def _stated(a: argparse.Namespace, measured: Measured) -> tc.Stated:
-    """What the recording's station says holds where the user says nothing, but
-    for another reference."""
+    """Statements by the options, else by the recording's station unless the reference
+    differs."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     own = measured.stated or tc.Stated()
     thermometer = getattr(a, "thermometer_uncertainty", None)
@@ -111,7 +111,7 @@ def _stated(a: argparse.Namespace, measured: Measured) -> tc.Stated:
 
 
 def counted(poses: int, left_out: int, what: str = "poses") -> str:
-    """How many there are, those left out among them."""
+    """Number of poses, with the number of excluded ones."""
     what = what.removesuffix("s") if poses == 1 else what
     return f"{poses} {what}" + (f", {left_out} of them left out" if left_out else "")
 
@@ -126,7 +126,7 @@ def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]
 
 
 def judge(limit: float | None, rms: float, reference: float) -> int:
-    """On the figure as it is printed."""
+    """Compare the printed figure with the limit; the exit code."""
     printed = tc.rounding.error(rms, reference)
     if limit is not None and not (printed is not None and printed <= limit):
         say(f"outside the limit: rms {rms:.3g}, limit {limit:.3g}")
@@ -141,8 +141,8 @@ def warn(lines: Iterable[str]) -> None:
 
 @contextmanager
 def telling_data_quality(measured: Measured) -> Iterator[None]:
-    """What spoils a recording may be why it is refused. Further poses mend none
-    of which most is not used."""
+    """Adds the data quality, a possible cause, to a refusal. Drops the wanted poses if
+    most of the recording is unused."""
     try:
         yield
     except tc.Refused as e:

@@ -35,19 +35,19 @@ class StopSignals:
         self._reload: Callable[[], None] | None = None
 
     def heed(self) -> dict[int, Any]:
-        """From now on; gives the handlers that were there. SIGTERM and SIGHUP
-        stay ignored where they are (`nohup`)."""
+        """Install the handlers; returns the previous ones. SIGTERM and SIGHUP stay
+        ignored if they were (`nohup`)."""
         heeded = [n for n in STOP_SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
         return {number: signal.signal(number, self._strike) for number in heeded}
 
     def cancel_by(self, cancel: Callable[[], bool]) -> None:
-        """From now on the first signal calls ``cancel``, which says if there
-        still is work, and the second again; also once the work has ended."""
+        """Let the first and the second signal call ``cancel``, also after the work;
+        ``cancel`` returns whether work remains."""
         self._cancel = cancel
 
     def reload_by(self, reload: Callable[[], None]) -> None:
-        """From now on SIGHUP calls ``reload``, once and again, and stops
-        nothing; as ever where the process has a terminal."""
+        """Let every SIGHUP call ``reload`` and stop nothing. With a terminal SIGHUP
+        keeps its meaning."""
         if not _on_a_terminal():
             self._reload = reload
             if self.watcher is not None:
@@ -85,7 +85,7 @@ _process: StopSignals | None = None
 
 
 def heed_stop_signals() -> None:
-    """To the end of the process."""
+    """Handle stop signals until the end of the process."""
     global _process
     _process = StopSignals(Watcher.started())
     _process.heed()

@@ -185,7 +185,7 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
 
 
 def add_table(parser: argparse.ArgumentParser) -> None:
-    """How a table is to be read that is no recording of ours."""
+    """Options for reading a table."""
     g = parser.add_argument_group("tables", "text with separators, or Parquet; what is clear is guessed and said")
     g.add_argument(
         "--columns", type=_columns, metavar="t=T,ux=X,uy=Y,uz=Z",
@@ -215,7 +215,7 @@ def _condition(text: str) -> tuple[str, str]:
 
 
 def add_uncertainty(parser: argparse.ArgumentParser) -> None:
-    """What is known of the reference and the thermometer, for the budget."""
+    """Options about the reference and the thermometer, for the budget."""
     parser.add_argument(
         "--latitude", type=latitude, metavar="DEG", help="with --height: gravity there is the reference"
     )
@@ -271,7 +271,7 @@ READINGS = "readings"
 
 
 def register(commands: Any) -> None:
-    """In the order in which a newcomer meets them."""
+    """Add the commands in the order in which a newcomer meets them."""
     _line(commands)
     _on_recordings(commands)
     _planning(commands)
@@ -294,7 +294,7 @@ def _command(commands: Any, name: str, run: str, help_line: str, more: str = "",
 
 def _line(commands: Any) -> None:
     p = _command(
-        commands, "demo", "line:demo_command", "the whole line on two simulated units, in about a minute",
+        commands, "demo", "stations:demo_command", "the whole line on two simulated units, in about a minute",
         "A CAN and a Modbus unit with hidden effects are recorded, calibrated, written, power-cycled and verified.",
         "demo --out demo-out",
     )  # fmt: skip
@@ -302,7 +302,7 @@ def _line(commands: Any) -> None:
     p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
     add_json(p)
     p = _command(
-        commands, "run", "line:run_command", "the whole line on the devices of a station file",
+        commands, "run", "stations:run_command", "the whole line on the devices of a station file",
         "Guides the operator from pose to pose; records, calibrates, writes the registers and verifies them.",
         "run station.toml",
     )  # fmt: skip
@@ -314,7 +314,7 @@ def _line(commands: Any) -> None:
     add_force(p)
     add_json(p)
     p = _command(
-        commands, "sim", "line:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
+        commands, "sim", "stations:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
     )
     p.add_argument("device", metavar="DEVICE.toml", type=Path)
     p = _command(

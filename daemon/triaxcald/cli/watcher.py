@@ -22,11 +22,10 @@ from triaxcald.abort import CLOSING_S, STOP_SIGNALS, ignore_stop_signals
 
 LAST = 3  # the signal that ends the process at once
 UNHEARD_S = 1.5
-"""From the last signal on, for Python to hear of it: the process is to be gone
-within two seconds."""
+"""Time for Python to handle the last signal: the process must end within 2 s."""
 ENDING_S = CLOSING_S + 4.0
-"""For a process that has heard of it, and finishes its files, however busy the
-machine is."""
+"""Time for a process that has handled the signal to finish its files, even on a busy
+machine."""
 _RELOADS, _ENDING = 128, 129  # bytes that are no signal
 _KILLED = b"triaxcal: killed: a third signal, and Python did not return; triaxcal log recover mends a recording\n"
 

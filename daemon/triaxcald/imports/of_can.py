@@ -14,11 +14,11 @@ from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.can.model import CanProfile
 from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.frames import EXTENDED, LONGEST_NS, Account, LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import EXTENDED, LONGEST_NS, Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
-from triaxcald.imports import text
+from triaxcald.imports import notices
 from triaxcald.imports.importing import Imported, Importing, Record, Ticks, Times, write_recording
 
 # Which frames of a log are those of one unit: by the identifiers of its profile,
@@ -244,7 +244,7 @@ class _Work:
         try:
             chosen.settle(log.name)
             if not counts["samples"]:
-                why = ", ".join(text.no_samples(counts)) or "no sample is whole"
+                why = ", ".join(notices.no_samples(counts)) or "no sample is whole"
                 raise InputError(
                     f"{log.name}: no sample in its {tc.number_format.number_of(chosen.taken, 'frame')} of the "
                     f"profile: {why}"

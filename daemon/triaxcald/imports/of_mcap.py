@@ -11,14 +11,14 @@ from typing import Any, cast
 import triaxcal as tc
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.hints import clipped, nearest
-from triaxcal_drivers.logs.frames import LONGEST_NS, Account
+from triaxcal_drivers.logs.can_frames import LONGEST_NS, Account
 from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
 from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
 from triaxcal_drivers.mcap.driver import McapProfile, schema_file, stream_reader
 from triaxcal_drivers.mcap.messages import MessageSchema
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
-from triaxcald.imports import text
+from triaxcald.imports import notices
 from triaxcald.imports.importing import Imported, Importing, Record, Times, write_recording
 
 # Whose messages those of a topic are, where several publish on it: an MCAP file has
@@ -217,7 +217,7 @@ class _Work:
         follow = self._channels.settle(self._log.name)
         counts = importing.counts
         if not counts["samples"]:
-            why = ", ".join(text.no_samples(counts)) or "none is of the readings"
+            why = ", ".join(notices.no_samples(counts)) or "none is of the readings"
             raise InputError(
                 f"{self._log.name}: no sample in its {tc.number_format.number_of(self._taken, 'message')} of "
                 f"the profile: {why}"

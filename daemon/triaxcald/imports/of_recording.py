@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from triaxcal_drivers.files import open_file
-from triaxcal_drivers.logs.frames import Account, LoggedFrame
+from triaxcal_drivers.logs.can_frames import Account, LoggedFrame
 from triaxcal_drivers.logs.kinds import MCAP, Kind, Log
 from triaxcald.errors import InputError
 from triaxcald.recording.bus import frame_rows, is_of_bus

@@ -1,5 +1,5 @@
-"""Register access with patience: requests that may be repeated are, a busy
-device is waited for, all is recorded."""
+"""Register access: repeats the requests that may be repeated, waits for a busy
+device, and records every request."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import DaemonError, TwoAnswer
 
-# How time passes while a device is written to, so that tests need not wait.
-
 
 @dataclass(frozen=True)
-class Pace:
-    """``sleep`` for so many seconds, ``clock_s`` monotonic."""
+class Clock:
+    """The clock of a register link: ``sleep`` takes seconds, ``now_s`` is monotonic
+    [s]. A test passes a virtual one."""
 
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
-    clock_s: Callable[[], float] = time.monotonic
+    now_s: Callable[[], float] = time.monotonic
 
 
-REAL_PACE = Pace()
+SYSTEM_CLOCK = Clock()
 
 
 T = TypeVar("T")
@@ -36,15 +35,15 @@ Kind = Literal["read", "write"]
 RETRIES = 2
 """A lost request in a hundred then fails one request in a million."""
 NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
-"""Nothing came back; unlike a refusal, that says nothing about what the device
-did."""
+"""Errors without any answer. Unlike a refusal, they leave open whether the device
+carried the request out."""
 
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` as on the wire, written or read (empty where a read failed);
-    ``error`` the driver's message. ``unanswered``: nothing came back, not even
-    a refusal."""
+    """One register request: ``raw`` as on the wire, written or read (empty if a read
+    failed); ``error`` is the driver's message. ``unanswered``: no reply came, not
+    even a refusal."""
 
     kind: Kind
     register: str
@@ -60,7 +59,7 @@ class RegisterLink:
     `RETRIES` times where no answer came, over a new connection where the old
     one was lost, and for `BUSY_S` where the device is busy. What a store or
     reset sequence writes is sent once. Once a kind of request has failed for
-    good, no more patience is spent on that kind until one succeeds, or until
+    good, no more retries are spent on that kind until one succeeds, or until
     `refresh`. ``record`` is told of every request that has ended. ``name`` is
     the device at its address, for messages.
 
@@ -75,11 +74,11 @@ class RegisterLink:
         profile: Profile,
         record: Callable[[RegisterAccess], None] | None = None,
         *,
-        pace: Pace = REAL_PACE,
+        clock: Clock = SYSTEM_CLOCK,
         name: str = "",
     ) -> None:
         steps = (*profile.sequences.store, *profile.sequences.reset)
-        self.pace, self.name, self.profile = pace, name, profile
+        self.clock, self.name, self.profile = clock, name, profile
         self._device = device
         self._record = record or (lambda access: None)
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}
@@ -88,13 +87,14 @@ class RegisterLink:
         self._watched = False
         self._second: TwoAnswer | None = None
         self.two_answered = self.tolerant = False
-        """Whether two units have answered, and whether that stops nothing."""
+        """Whether two units have answered, and whether the work continues anyway."""
         self.doubled = 0
         """Answers that came twice, byte for byte, since the last `listen`."""
         self.touched: set[str] = set()
-        """Registers that somebody has tried to write."""
-        self.marked: list[str] = []
-        """Registers that got a mark, or their value back, for each such write."""
+        """Registers with an attempted write."""
+        self.probed: list[str] = []
+        """Registers written by the restart check, one entry a write: a probe, or the
+        register's own value again."""
 
     async def open(self) -> None:
         try:
@@ -111,12 +111,12 @@ class RegisterLink:
         return self._device.stream(names)
 
     def refresh(self) -> None:
-        """Be as patient as at first."""
+        """Allow all retries again."""
         self._tired.clear()
 
     def go_on_unrecorded(self) -> None:
-        """From now on no failure to record a request stops the work: putting a
-        device in order weighs more."""
+        """Continue if a request cannot be recorded: restoring the device has
+        priority."""
         record = self._record
 
         def lenient(access: RegisterAccess) -> None:
@@ -126,18 +126,21 @@ class RegisterLink:
         self._record = lenient
 
     def watch(self) -> None:
-        """From now on no answer too many goes unnoticed."""
+        """Report every extra answer from now on."""
         self._watched = True
 
     def tolerate(self) -> None:
-        """Puts a device in order also while two units answer."""
+        """Continue while two units answer, to restore the device."""
         self._watched, self._second = False, None
         self.tolerant = True
 
     async def listen(self, seconds: float) -> list[ExtraAnswer]:
-        """Waits so long by the host's clock. Returns the answers that no request
-        explains and that contradict the first answer; counts the others in
-        ``doubled``. None of a device whose driver cannot tell."""
+        """Listen for ``seconds`` of the host's clock.
+
+        Returns the answers that belong to no request and contradict the first
+        answer; counts the others in ``doubled``. A driver that cannot tell gives
+        none.
+        """
         listen = getattr(self._device, "listen", None)
         extra: list[ExtraAnswer] = [] if listen is None else await listen(seconds)
         self.doubled += sum(e.same for e in extra)
@@ -147,7 +150,7 @@ class RegisterLink:
         return await self._patiently("read", lambda: self._read(register))
 
     async def read_once(self, register: str) -> bytes:
-        """For a caller that repeats by itself."""
+        """Read without a repetition; the caller repeats."""
         return await self._read(register)
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
@@ -157,7 +160,7 @@ class RegisterLink:
             await self._patiently("write", lambda: self._write(register, raw, timeout_s))
 
     async def renew(self) -> None:
-        """A new connection, where one is to be had."""
+        """Open a new connection if possible."""
         with suppress(*NO_CONTACT):
             await self.close()
             await self.open()
@@ -169,7 +172,7 @@ class RegisterLink:
             try:
                 answer = await request()
             except DeviceBusy as e:
-                failure, now_s = e, self.pace.clock_s()
+                failure, now_s = e, self.clock.now_s()
                 busy_since_s = now_s if busy_since_s is None else busy_since_s
                 patient = now_s - busy_since_s < BUSY_S
             except NO_CONTACT as e:
@@ -182,7 +185,7 @@ class RegisterLink:
                 self._tired.add(kind)
                 raise failure
             if isinstance(failure, DeviceBusy):
-                await self.pace.sleep(BUSY_PAUSE_S)
+                await self.clock.sleep(BUSY_PAUSE_S)
             elif not isinstance(failure, DeviceSilent):
                 await self.renew()
 
@@ -217,8 +220,8 @@ class RegisterLink:
 
     @contextmanager
     def _failure_told(self, kind: Kind, register: str, raw: bytes) -> Iterator[None]:
-        """A device that could not be opened again says of a request only that
-        it is not open: what kept it from that is told instead."""
+        """Replace the error "not open" of a request by the error of the failed
+        opening."""
         try:
             yield
         except DriverError as e:

@@ -14,7 +14,7 @@ from triaxcal_drivers.registers import TYPES
 from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.sequence import probe
+from triaxcald.provision.sequence import contact_register
 
 
 class WrongUnit(ProvisionError):
@@ -71,8 +71,8 @@ async def check_identity(
 async def identified(
     link: RegisterLink, bundle: Bundle, expected_serial: str | None, *, where: str, device: Device | None = None
 ) -> IdentityRead:
-    """As `check_identity` of the ``device``, by default by the link, and no
-    other unit answers at the same address. Raises TwoAnswer too."""
+    """`check_identity` of the ``device`` (default: the link), and a check that no
+    other unit answers at the address. Raises TwoAnswer too."""
     try:
         identity = await check_identity(device or link, bundle, expected_serial, where=where)
     except WrongUnit:
@@ -84,8 +84,7 @@ async def identified(
 
 
 def _wrong(profile: Profile, name: str, number: int) -> type[WrongUnit]:
-    """What it shows that a register of the identity holds an unexpected
-    number."""
+    """Diagnosis of an unexpected number in a register of the identity."""
     ones = 256 ** TYPES[profile.registers[name].type].size - 1
     return BlankIdentity if number in (0, -1, ones) else WrongUnit
 
@@ -100,13 +99,13 @@ async def _also(link: RegisterLink, bundle: Bundle, serial: str) -> bool:
 
 
 ABORT_BYTES = 8
-"""Of a CANopen answer that refuses."""
+"""Length of a CANopen abort."""
 LISTEN_S = 0.2
-"""By the host's clock: longer than a node takes that answers slowly, and short
-beside the time that an operator takes to put a unit in place."""
+"""By the host's clock: longer than the answer of a slow node, and short compared with
+the time in which an operator mounts a unit."""
 ASKED = 3
-"""A line doubles so many answers in a row by chance once in ten thousand times,
-if it doubles one in twenty."""
+"""Requests that must all be answered twice before two units are reported. A line that
+doubles one answer in twenty does so by chance once in ten thousand times."""
 
 
 async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
@@ -119,7 +118,7 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
     """
     profile = bundle.profile
     readable = (name for name, register in profile.registers.items() if register.access != "wo")
-    name = probe(profile) or next(readable, None)
+    name = contact_register(profile) or next(readable, None)
     if name is None:
         return
     for _ in range(ASKED):
@@ -137,7 +136,7 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
 
 
 async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[ExtraAnswer]]:
-    """What a register was answered with, and the answers that contradict."""
+    """Value of a register, and the contradicting answers."""
     answers = [await link.read(name)]
     most = max(TYPES[link.profile.registers[name].type].size, ABORT_BYTES)
     # Another program may ask the unit for something else, and a stream may be

@@ -1,5 +1,5 @@
-"""What a provisioning sets out to do, on disk before the first register is
-written, until the device is settled."""
+"""The journal of a provisioning: its old and wanted registers, on disk from before
+the first write until the state of the device is settled."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from triaxcald.provision.registers import (
 
 FORMAT, FOLDER = "triaxcal.journal/1", "journal"
 Step = Literal["writing", "storing", "stored", "unverified"]
-"""``unverified``: it came to its end, on a device that no restart has shown to
-hold it."""
+"""``unverified``: the provisioning ended, but no restart has proven the stored
+values."""
 
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 _WHOLE = re.compile(r"(-?)([0-9]+)")
 _RUN = "[0-9a-f]" * 8 + "-*"
-"""How the identifier of a run begins."""
+"""Prefix pattern of the identifier of a run."""
 
 
 @dataclass(frozen=True)
 class Owner:
-    """Whose journal it is: a unit by its product and serial number, or, without
-    a serial number, whatever unit is in the ``slot``."""
+    """Owner of a journal: a unit by its product and serial number, or, without a
+    serial number, any unit in the ``slot``."""
 
     product: str
     serial: str | None
@@ -80,14 +80,14 @@ class Journal:
 
     @staticmethod
     def of(folder: Path, owner: Owner, run: str) -> Journal:
-        """Where a provisioning by that run keeps its journal."""
+        """The journal of a provisioning by that run."""
         return Journal(folder / FOLDER / f"{_own_name(owner, run)}.json")
 
     @staticmethod
     def existing(folder: Path, owner: Owner) -> list[Journal]:
-        """Those that may be of the unit, the newest first; the names of earlier
-        versions last. Without a serial number they may be of other units that
-        were in the same slot."""
+        """Existing journals that may belong to the unit, the newest first; names of
+        earlier versions last. Without a serial number they may belong to other units
+        of the same slot."""
         within = folder / FOLDER
         if owner.serial is None:
             runs = sorted(within.glob(f"{_safe(owner.slot)}-{_RUN}.json"), reverse=True)
@@ -97,8 +97,8 @@ class Journal:
         return [Journal(path) for path in paths if path.exists()]
 
     def read(self) -> Entry | None:
-        """None where nothing was cut short. Raises InputError on a file that is
-        no journal."""
+        """The entry; None if there is no file. Raises InputError on a file that is no
+        journal."""
         try:
             text = self.path.read_bytes()
         except FileNotFoundError:
@@ -113,7 +113,7 @@ class Journal:
             ) from e
 
     def write(self, entry: Entry) -> None:
-        """Returns once it is on the disk. Raises DiskError."""
+        """Write the entry, and return once it is on the disk. Raises DiskError."""
         document = {
             "format": FORMAT,
             "unit": entry.unit,
@@ -217,14 +217,14 @@ def registers_of(held: Mapping[str, str]) -> dict[str, bytes]:
     return {str(name): bytes.fromhex(raw) for name, raw in held.items()}
 
 
-# What an earlier provisioning that was cut short had begun, by its journal.
+# The image of an interrupted provisioning, from its journal.
 
 
 async def journaled_image(
     link: RegisterLink, bundle: Bundle, *, folder: Path, unit: str, expected_serial: str | None, where: str
 ) -> tuple[RegisterImage, str | None]:
-    """What the provisioning of this device that was cut short was to write, and
-    the device's serial number.
+    """The wanted image of this device's interrupted provisioning, and the device's
+    serial number.
 
     Raises InputError where there is none, or where it was begun with another
     profile; WrongUnit, DriverError.
@@ -236,7 +236,7 @@ async def journaled_image(
         path = Journal.of(folder, owner, "RUN").path
         raise InputError(f"{path}: no such file: no provisioning of this unit was cut short")
     journal, entry = found[0]
-    if len(found) > 1:  # of several units, one after the other in this slot
+    if len(found) > 1:  # several units were in this slot, one after the other
         held = await take_snapshot(link, bundle)
         journal, entry = next(((j, e) for j, e in found if _fits(e, held)), found[0])
     if entry.profile_sha256 != bundle.digest():

@@ -1,4 +1,4 @@
-"""Sees a device lose its supply and come back."""
+"""Detects a power cycle of a device."""
 
 from __future__ import annotations
 
@@ -7,31 +7,28 @@ from contextlib import suppress
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
-from triaxcald.provision.sequence import probe, reconnect
+from triaxcald.provision.sequence import contact_register, reconnect
 
 LOOK_S = 0.2
-"""So often the device is asked; a supply is off for longer when a person
-switches it."""
+"""Period of the requests; a person switches a supply off for longer."""
 MISSED = 3
-"""So many requests in a row go unanswered by chance once in a million times
-where a link loses one in a hundred."""
+"""Unanswered requests in a row that count as no supply: by chance once in a million
+on a link that loses one in a hundred."""
 
 
 def least_off_s(profile: Profile) -> float:
-    """The supply has to be off for so long to be seen off."""
+    """Shortest time without supply that is detected [s]."""
     return MISSED * (profile.sampling.reply_timeout_s + LOOK_S)
 
 
 async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) -> bool:
-    """Waits until the device, which answered, has gone silent and answers
-    again; whether it has within ``patience_s``.
-
-    One that is busy, or refuses, has its supply.
+    """Whether the device, within ``patience_s``, answers, goes silent and answers
+    again. A busy or refusing device has its supply.
     """
-    register = probe(profile) or next(iter(profile.registers))
-    deadline_s, missed, answered = link.pace.clock_s() + patience_s, 0, False
+    register = contact_register(profile) or next(iter(profile.registers))
+    deadline_s, missed, answered = link.clock.now_s() + patience_s, 0, False
     while missed < MISSED:
-        if link.pace.clock_s() >= deadline_s:
+        if link.clock.now_s() >= deadline_s:
             return False
         try:
             await link.read_once(register)
@@ -41,8 +38,8 @@ async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) 
         except NO_CONTACT:
             missed += answered
             await link.renew()
-        await link.pace.sleep(LOOK_S)
+        await link.clock.sleep(LOOK_S)
     with suppress(DriverError):
-        await reconnect(link, profile, max(deadline_s - link.pace.clock_s(), LOOK_S))
+        await reconnect(link, profile, max(deadline_s - link.clock.now_s(), LOOK_S))
         return True
     return False

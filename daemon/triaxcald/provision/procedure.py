@@ -17,8 +17,16 @@ from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of, was_cut_short
-from triaxcald.provision.proof import Restart, proven_restart
-from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, doubts, image_of, take_snapshot, unstable
+from triaxcald.provision.registers import (
+    RegisterImage,
+    SanityWarning,
+    Snapshot,
+    image_of,
+    sanity_warnings,
+    take_snapshot,
+    unstable,
+)
+from triaxcald.provision.restart_check import Restart, checked_restart
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.software import new_run_id
@@ -45,7 +53,7 @@ async def restore(
     registers that differ are written, and stored if ``stored``. The store is
     also sent if no restart has shown what is stored: the registers in use may
     differ from it. Returns once every register reads back as the snapshot's raw
-    bytes; the evidence is a restart only if a mark was gone after it. Raises
+    bytes; the evidence is a restart only if a probe was gone after it. Raises
     ProvisionError that says why not; WrongUnit, with nothing written, if another
     unit answers.
     """
@@ -66,23 +74,22 @@ async def restore(
 
 
 async def let_a_store_end(link: RegisterLink, bundle: Bundle) -> None:
-    """A restart in the middle of a store could spoil the stored copy. What came
-    of it shows after the restart."""
+    """Wait for a running store to end: a restart in the middle of it could corrupt
+    the stored copy."""
     waits = [step for step in bundle.profile.sequences.store if isinstance(step, (WaitStep, PollStep))]
     with suppress(DriverError, StationError):
         await run_steps(link, bundle, "store", waits)
 
 
 async def differing(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> tuple[str, ...]:
-    """The registers in which the snapshot's own unit differs from it. Raises
+    """Registers of the snapshot's own unit that differ from the snapshot. Raises
     WrongUnit, DriverError."""
     await check_identity(link, bundle, snapshot.serial)
     return snapshot.differing((await take_snapshot(link, bundle, snapshot.raw)).raw)
 
 
 async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
-    """A device that had its power cut is back after a moment, on a new
-    connection."""
+    """Check the identity, over a new connection if the device just lost its power."""
     try:
         await check_identity(link, bundle, snapshot.serial)
     except NO_CONTACT:
@@ -91,16 +98,16 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
 
 
 async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images) -> bool:
-    """Whether a mark shows that the device restarted."""
+    """Whether a probe shows that the device restarted."""
     if not bundle.profile.sequences.reset:
         return False
     await lock_quietly(link, bundle)
     try:
-        return (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
+        return (await checked_restart(link, bundle, snapshot.serial, *known)).probe_gone
     except WrongUnit:  # one of ProvisionError
         raise
     except (RegisterRefused, ProvisionError):
-        return False  # writing back may still do
+        return False  # writing the registers back may still succeed
 
 
 async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images, stored: bool) -> bool:
@@ -109,11 +116,11 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, kn
         await run_sequence(link, bundle, "unlock")
         for name in await differing(link, bundle, snapshot):
             await link.write(name, snapshot.raw[name])
-        await _require_equal(link, bundle, snapshot)  # before anything wrong is made permanent
+        await _require_equal(link, bundle, snapshot)  # never store a wrong value
         if stored:
-            await require_alone(link, bundle)  # a store reaches whoever hears it
+            await require_alone(link, bundle)  # a store reaches every unit at the address
             acknowledged = await run_sequence(link, bundle, "store")
-            await _require_equal(link, bundle, snapshot)  # the supply may have failed in the store
+            await _require_equal(link, bundle, snapshot)  # the supply may have failed during the store
     except (WrongUnit, TwoAnswer):
         theirs = True
         raise
@@ -124,7 +131,7 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, kn
         return False
     restarted = False
     if bundle.profile.sequences.reset:
-        restarted = (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
+        restarted = (await checked_restart(link, bundle, snapshot.serial, *known)).probe_gone
     await _require_equal(link, bundle, snapshot)
     if not acknowledged and not restarted:
         raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")
@@ -141,16 +148,16 @@ T = TypeVar("T")
 
 @dataclass
 class Provisioning:
-    """One device on its way to a new calibration: `examine`, then `write`, and
-    `undo` where it must not stay.
+    """Provisioning of one device: `examine`, then `write`; `undo` if the new
+    calibration must not stay.
 
-    ``folder`` is the station's, where the journal lies; ``started`` a time in
-    words for it. ``held`` says at any moment what the device holds, whatever
-    has been raised. ``found`` is what the device held at first; ``before`` is
-    what an undoing brings back: the same, or, where an earlier provisioning was
-    cut short, what the device held before that one. ``after`` was read last.
-    ``differing`` are the registers in which the device differed from the image,
-    ``written`` those that were written, ``steps`` what was done, in order.
+    ``folder`` is the station's, with the journal; ``started`` is a time as text for
+    the journal. ``held`` is the state of the device at any moment, also after an
+    exception. ``found`` is the first snapshot. ``before`` is the snapshot that an
+    undo restores: ``found``, or the one before an earlier provisioning that was cut
+    short. ``after`` is the last snapshot. ``differing`` are the registers that
+    differed from the image, ``written`` the written ones, ``steps`` the steps in
+    order.
     """
 
     link: RegisterLink
@@ -165,12 +172,12 @@ class Provisioning:
     """The identifier of this run. It names the journal of a unit without a
     serial number."""
     source: Path | None = None
-    """The journal that `put_back` was asked to go by."""
+    """The journal from which `put_back` takes its snapshot."""
     power_cycle: Callable[[], Awaitable[bool]] | None = None
-    """Has the supply switched off and on, where nothing else shows what is
-    stored; whether that was seen."""
+    """Asks for a power cycle if no restart proves the stored values; returns whether
+    the supply was seen off and on."""
     held: Held = field(default_factory=Held)
-    doubts: list[Doubt] = field(default_factory=list)
+    warnings: list[SanityWarning] = field(default_factory=list)
     differing: tuple[str, ...] = ()
     written: list[str] = field(default_factory=list)
     steps: list[str] = field(default_factory=list)
@@ -179,13 +186,12 @@ class Provisioning:
     """Whether an earlier provisioning was cut short."""
     undoing_failed: str | None = None
     restart_owed: bool = False
-    """Whether what was read may be what is in use alone, which a restart would
-    have shown."""
+    """Whether a restart still has to show that the values read are the stored ones."""
     _store_owed: bool = False
-    """What is in use is the image, and the provisioning that was cut short may
-    not have stored it."""
+    """Whether the image is in use, but the interrupted provisioning may not have
+    stored it."""
     _restarted: bool = False
-    """Whether a mark was gone before the registers were read at first."""
+    """Whether a restart was proven before the first reading of the registers."""
     _journaled: bool = False
     _earlier: list[Journal] = field(default_factory=list)
     """Journals of this unit that earlier provisionings left, the newest first."""
@@ -204,12 +210,12 @@ class Provisioning:
 
     @property
     def identified(self) -> bool:
-        """Whether it is known who is there."""
+        """Whether the unit is identified."""
         return hasattr(self, "journal")
 
     @property
     def examined(self) -> bool:
-        """Whether it is known who is there, and what it held."""
+        """Whether the unit is identified and its registers are read."""
         return hasattr(self, "before")
 
     @property
@@ -219,13 +225,12 @@ class Provisioning:
 
     @property
     def stores(self) -> bool:
-        """Whether what is written takes a store to last; else every write
-        lasts."""
+        """Whether a write needs a store to last; else every write lasts."""
         return bool(self.bundle.profile.sequences.store)
 
     @property
     def open_journal(self) -> Path | None:
-        """The journal, where one lies and is still needed."""
+        """Path of the journal, if there is one and it is still needed."""
         if self.settled:
             return None
         if self._journaled:
@@ -233,27 +238,29 @@ class Provisioning:
         return self._earlier[0].path if self._earlier else None
 
     async def examine(self, *, restart: bool = True) -> None:
-        """Who is there, and what it holds. Nothing is written, but what shows
-        the restart of a device that has a journal.
+        """Identify the unit and read its registers. Writes nothing, except the probe
+        of a restart check if the device has a journal.
 
-        A device that holds the image already, or that has a journal, is
-        restarted, where ``restart`` allows: what is in use may not be what is
-        stored. Raises ProvisionError, WrongUnit, InputError (the journal), DriverError,
+        A device that already holds the image, or that has a journal, is restarted if
+        ``restart`` allows it: its values in use may differ from the stored ones.
+        Raises ProvisionError, WrongUnit, InputError (the journal), DriverError,
         SequenceStalled.
         """
         if not self.examined:
             await self.look()
         journals = self._journals
+        # Step 1: a restart, after which the values in use are the stored ones.
         if restart and self.restart_owed:
-            if not journals:  # `write` shows a restart with a mark, once the doubts are answered
+            if not journals:  # `write` proves its restart later, once the warnings are answered
                 await self._sequence("reset")
             else:
                 self.steps.append("reset")
                 known = [image for _, entry in journals for image in (entry.before, entry.wanted)]
-                self._restarted = (await self._restart(*known)).mark_gone
+                self._restarted = (await self._restart(*known)).probe_gone
             self.found = await self._read("reading the stored calibration")
             self.restart_owed = False
             self._compare()
+        # Step 2: continue an interrupted provisioning, or check the old calibration.
         entry = self._entry_of_this_unit(journals)
         if entry is not None:
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
@@ -264,11 +271,11 @@ class Provisioning:
             self.held.now(DeviceState.UNTOUCHED, Evidence.NOTHING_WRITTEN)
             again = await self._read("reading the old calibration again")
             profile = self.bundle.profile
-            self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
+            self.warnings = unstable(profile, self.found, again) or sanity_warnings(profile, self.found, self.image)
 
     async def look(self) -> None:
-        """Who is there, and what its registers hold. Nothing is written, and the
-        device is not restarted. Raises as `examine` does."""
+        """Identify the unit and read its registers, without a write or a restart.
+        Raises as `examine` does."""
         await self.identify()
         self._journals = journals_of(self.folder, self.owner, self.bundle.profile)
         if self._journals:
@@ -283,28 +290,28 @@ class Provisioning:
         self.differing = self.found.differing(self.image.raw)
 
     def _entry_of_this_unit(self, journals: list[tuple[Journal, Entry]]) -> Entry | None:
-        """The journal that was cut short in this device. Those of other units,
-        as far as they are known to be, are none of this provisioning's."""
+        """The journal entry of an interrupted provisioning of this device; journals
+        of other units are ignored as far as they can be told apart."""
         profile = self.bundle.profile
         fits = [
             (journal, entry)
             for journal, entry in journals
             if was_cut_short(entry, profile, self.found, self.image, self._restarted)
         ]
-        # A provisioning that went on with an earlier journal left one of its own.
+        # A provisioning that continued an earlier journal left one of its own.
         same = [journal for journal, entry in fits if entry.before == fits[0][1].before]
         self._earlier = list(dict.fromkeys([*same, *self._named_for_it(journals)]))
         return fits[0][1] if fits else None
 
     def _named_for_it(self, journals: list[tuple[Journal, Entry]]) -> list[Journal]:
-        """Journals with the product and the serial number of this unit. An
-        earlier version did not name the product, but the profile."""
+        """Journals with the product and the serial number of this unit. A journal of
+        an earlier version has the digest of the profile in place of the product."""
         mine = self.bundle.digest()
         return [j for j, e in journals if e.serial is not None and (e.product or e.profile_sha256 == mine)]
 
     async def identify(self) -> None:
-        """Who is there, and whether alone. Raises WrongUnit, TwoAnswer,
-        DriverError."""
+        """Identify the unit, and check that no other one answers. Raises WrongUnit,
+        TwoAnswer, DriverError."""
         self.steps.append("identity")
         self.identity = await identified(self.link, self.bundle, self.expected_serial, where=self.where)
         self.link.watch()
@@ -314,9 +321,9 @@ class Provisioning:
     async def write(self) -> None:
         """Write what differs, store it, restart the device, and read it back.
 
-        Raises ProvisionError that says what failed at which step, WrongUnit,
-        DiskError. A cancellation, like any other exception, goes on only once
-        the old calibration is back. ``held`` then says whether it is.
+        Raises ProvisionError with the failed step and its error, WrongUnit,
+        DiskError. Every exception, a cancellation too, is raised only after the
+        attempt to restore the old calibration; ``held`` has its result.
         """
         try:
             if self.differing or self._store_owed:
@@ -339,12 +346,12 @@ class Provisioning:
             raise
 
     async def put_back(self, snapshot: Snapshot) -> None:
-        """Instead of `examine` and `write`: the registers of ``snapshot``,
-        whose image this is, back into the device.
+        """Write ``snapshot`` back into the device, in place of `examine` and `write`;
+        ``image`` is that of the snapshot.
 
-        An earlier journal stays as it is, so that a cut leaves no more to
-        choose from than there was. Raises ProvisionError that says why they are
-        not back, WrongUnit, DriverError, DiskError.
+        An earlier journal stays unchanged, so an interruption adds no third set of
+        values. Raises ProvisionError with the reason if the snapshot is not back;
+        WrongUnit, DriverError, DiskError.
         """
         self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         await self.identify()
@@ -354,7 +361,7 @@ class Provisioning:
             journals = journals_of(self.folder, self.owner, self.bundle.profile)
             mine = [(j, e) for j, e in journals if j.path == self.source or (e.serial and e.before == snapshot.raw)]
             self._earlier = list(dict.fromkeys([*(j for j, _ in mine), *self._named_for_it(journals)]))
-            if mine:  # what was to be written is known: a device that holds it holds no mixture
+            if mine:  # the wanted image is known: a device that holds it is not in a mixed state
                 self.image = image_of(self.bundle.profile, mine[0][1].wanted)
         if self.differing and not self._earlier:
             self._note("writing")
@@ -369,13 +376,12 @@ class Provisioning:
             raise ProvisionError(self.undoing_failed or "the old calibration is not back")
 
     async def undo(self) -> None:
-        """The old calibration back in the device, by whatever it takes;
-        ``held`` says whether it is."""
+        """Restore the old calibration by every means; ``held`` has the result."""
         await to_its_end(self._undo())
 
     async def prove_old(self) -> None:
-        """After an undoing that no restart has proven, by a power cycle, where
-        one can be asked for."""
+        """Prove the restored calibration by a power cycle, if no restart has proven it
+        and a power cycle can be requested."""
         if self.power_cycle is None or self.held.settled:
             return
         self.steps.append("power cycle")
@@ -388,13 +394,13 @@ class Provisioning:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to be cleared up."""
+        """Whether the state of the device is known and needs no further work."""
         return self.held.settled and (self.undoing_failed is None or self.held.state is DeviceState.OLD)
 
     @contextmanager
     def finishing(self) -> Iterator[None]:
-        """At its end the journal goes, where nothing is left to be cleared up.
-        Raises DiskError, unless something else has been raised."""
+        """Calls `finish` at the end of the context. Raises DiskError, unless another
+        exception is being raised."""
         try:
             yield
         except BaseException:
@@ -404,7 +410,8 @@ class Provisioning:
         self.finish()
 
     def finish(self) -> None:
-        """As `finishing` does at its end. Raises DiskError."""
+        """Remove the journals of a settled device; note an unverified one. Raises
+        DiskError."""
         if not self.examined:
             return
         if self.settled:
@@ -414,16 +421,17 @@ class Provisioning:
         elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
             self._note("unverified")
 
-    # Forwards.
+    # Steps of `write`.
 
     async def _write(self) -> None:
+        # The journal is on disk before the first write.
         await self._same_unit("identity before the unlock")
         self._note("writing")
         self._unlocked = True
         await self._sequence("unlock")
         for name in self.differing:
             self.steps.append(f"writing {name}")
-            if not self.stores:  # each write lasts, as a store does
+            if not self.stores:  # each write lasts at once
                 await self._require_same_unit()
             self.written.append(name)
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
@@ -438,13 +446,15 @@ class Provisioning:
             count = await self._times_stored()
             self._store_asked = True
             self.stored = await self._sequence("store")
+            # The acknowledgement, the write counter and the read-back are separate
+            # observations: an unanswered store may have happened.
             if self.stored:
                 self.held.saw(Observation.ACKNOWLEDGED)
             else:
                 await self._reach()
             self._by_counter(count, await self._times_stored())
-            # The supply may have failed in the store: then the device has started
-            # from half of it.
+            # If the supply failed during the store, the device has restarted from a
+            # partial copy.
             self.after = await self._read_after_store()
             self._require_image()
         else:
@@ -466,15 +476,15 @@ class Provisioning:
             return await self._look()
 
     async def _prove(self) -> None:
-        self._decided = True  # whatever happens now, writing more would not make it any surer
+        self._decided = True  # further writes would not improve the evidence
         try:
             if self.resets:
                 await self._prove_by_restart()
             else:
-                await self._decide(Evidence.READ_BACK)  # it may have dropped the registers when it was locked
+                await self._decide(Evidence.READ_BACK)  # the lock may have discarded unstored registers
             if self.held.state is not DeviceState.NEW_VERIFIED:
                 await self._prove_by_power_cycle()
-        except TwoAnswer:  # a mark may be in use, and a restart may have changed what is
+        except TwoAnswer:  # a probe may be in use, or a restart may have changed the registers
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
             raise
         if self.held.state is DeviceState.UNKNOWN:
@@ -497,14 +507,14 @@ class Provisioning:
                 raise
             return
         except ProvisionError:
-            self._decided = False  # a value that nobody wants is in use
+            self._decided = False  # the probe is still in use
             raise
         self.steps.append("identity after the reset")
-        await self._decide(Evidence.RESTART if restart.mark_gone else Evidence.READ_BACK)
+        await self._decide(Evidence.RESTART if restart.probe_gone else Evidence.READ_BACK)
 
     async def _decide(self, evidence: Evidence) -> None:
-        """State what the device holds, by reading it. Raises ProvisionError if
-        that is not the image."""
+        """Read the registers and set the state of the device. Raises ProvisionError if
+        they are not the image."""
         try:
             self.after = await self._look()
         except NO_CONTACT:
@@ -521,7 +531,7 @@ class Provisioning:
         self.held.now(DeviceState.MIXED if self.after.differing(self.before.raw) else DeviceState.UNKNOWN, evidence)
         self._require_image()
 
-    # Backwards.
+    # Steps of `undo`.
 
     async def _give_up(self) -> None:
         if self._decided:
@@ -562,10 +572,12 @@ class Provisioning:
         await to_its_end(self._undo_beside_another(lasting))
 
     async def _undo_beside_another(self, lasting: bool) -> None:
-        """While two units answer, a write reaches both. So nothing is stored: a
-        restart brings back what each of them has stored, and without one the old
-        registers are put in use again. What a store or a direct write may have
-        changed stays until one unit is taken away."""
+        """Undo while two units answer, when every write reaches both.
+
+        Nothing is stored: a restart restores the stored values of each unit; without
+        a restart command the old registers are put in use again. Changes by a store
+        or a lasting write stay until one unit is taken away.
+        """
         self.link.tolerate()
         self.undoing_failed = "two units answer; take one of them away, then restore"
         with suppress(DriverError, StationError):
@@ -589,7 +601,7 @@ class Provisioning:
         await lock_quietly(self.link, self.bundle)
 
     async def _named(self, e: DriverError | StationError) -> DriverError | StationError:
-        """Two units that answer, with the serial numbers of both."""
+        """The error, with both serial numbers if two units answer."""
         if not isinstance(e, TwoAnswer):
             return e
         self.link.tolerate()
@@ -602,10 +614,10 @@ class Provisioning:
         return e
 
     async def _judge(self, lasting: bool) -> None:
-        """What an undoing that failed has left. Raises DriverError,
+        """Set the state of the device after a failed undo. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
+        restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).probe_gone
         held = self.after = await self._look()
         state = self._state_of(held)
         if not restarted and state is DeviceState.OLD and lasting:
@@ -615,22 +627,22 @@ class Provisioning:
         self.held.now(state, Evidence.RESTART if restarted else Evidence.READ_BACK)
 
     def _state_of(self, held: Snapshot) -> DeviceState:
-        """What a device holds that started with these registers."""
+        """State of a device that restarted with these registers."""
         if not held.differing(self.before.raw):
             return DeviceState.OLD
         if not self.before.differing(self.image.raw) and not held.differing(self.found.raw):
-            return DeviceState.UNKNOWN  # a restoration did not change it, and nobody knows what is new
+            return DeviceState.UNKNOWN  # a restoration changed nothing, and the new calibration is unknown
         return DeviceState.MIXED if held.differing(self.image.raw) else DeviceState.NEW_VERIFIED
 
-    # Steps of both.
+    # Shared steps.
 
     async def _sequence(self, label: Label) -> bool:
         self.steps.append(label)
         return await run_sequence(self.link, self.bundle, label)
 
     async def _restart(self, *known: Mapping[str, bytes]) -> Restart:
-        restart = await proven_restart(self.link, self.bundle, self.identity.serial, *known)
-        if restart.mark_gone:
+        restart = await checked_restart(self.link, self.bundle, self.identity.serial, *known)
+        if restart.probe_gone:
             self.held.saw(Observation.MARK_GONE)
         return restart
 
@@ -646,7 +658,7 @@ class Provisioning:
         await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
 
     async def _look(self) -> Snapshot:
-        """All registers, of a unit that alone answered until they were read."""
+        """Snapshot of the same unit, with no other one answering."""
         await self._require_same_unit()
         found = await take_snapshot(self.link, self.bundle)
         if not self.link.tolerant:
@@ -662,8 +674,8 @@ class Provisioning:
         return None if name is None else await self.link.read(name)
 
     def _by_counter(self, before: bytes | None, after: bytes | None) -> None:
-        """Whether the device counted the store. Raises ProvisionError if a store
-        without an answer was not counted, and no restart can show more."""
+        """Compare the write counter before and after the store. Raises ProvisionError
+        if an unanswered store was not counted and no restart can show more."""
         if before is not None and before != after:
             self.held.saw(Observation.COUNTER_ADVANCED)
             if not self.stored:

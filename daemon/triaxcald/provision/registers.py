@@ -1,5 +1,5 @@
-"""A device's calibration registers: their image, the values that they held and
-whether these are plausible, and the correction that they make."""
+"""A device's calibration registers: their image, a snapshot of their values with
+sanity warnings, and the correction that they make."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from triaxcald.provision.identity import read_serial
 
 @dataclass(frozen=True)
 class Word:
-    """One register of an image. ``value`` is wanted and ``held`` is what
-    ``raw`` (bytes as on the wire) says, both in the register's ``unit``."""
+    """One register of an image. ``value`` is the wanted value, ``held`` the one that
+    ``raw`` (bytes as on the wire) encodes, both in the register's ``unit``."""
 
     register: str
     role: str
@@ -45,11 +45,11 @@ class Word:
     held: float
     unit: str
     step: float
-    """How far apart the values are that the register can hold there."""
+    """Distance of neighbouring register values there."""
 
     @property
     def cost(self) -> float:
-        """What the register's format changes: held − value, in ``unit``."""
+        """Rounding of the register's format: held − value, in ``unit``."""
         return self.held - self.value
 
 
@@ -170,7 +170,7 @@ async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | N
     return Snapshot({name: await device.read(name) for name in names}, serial)
 
 
-# Is what the device holds a calibration at all? Values alone, no I/O.
+# Sanity warnings about a snapshot. Values alone, no I/O.
 
 Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
@@ -181,14 +181,13 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
 }
 EFFECT_BOUND = 10.0
-"""g per g², per K and so on: an effect as large as this would leave nothing of
-the measurement."""
+"""g per g², per K and so on: a larger effect would exceed the measurement itself."""
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Why a snapshot is hardly a calibration. ``low`` and ``high`` bound what
-    was expected of ``value``."""
+class SanityWarning:
+    """Reason why a snapshot is hardly a calibration. ``low`` and ``high`` are the
+    expected limits of ``value``."""
 
     kind: Kind
     register: str
@@ -203,29 +202,32 @@ def is_blank(snapshot: Snapshot) -> bool:
     return bool(held) and len(set(held)) == 1 and held[0] in (0x00, 0xFF)
 
 
-def unstable(profile: Profile, first: Snapshot, second: Snapshot) -> list[Doubt]:
-    """Registers that two readings in a row do not agree on."""
-    return [Doubt("unstable", name, profile.decode(name, second.raw[name])) for name in first.differing(second.raw)]
+def unstable(profile: Profile, first: Snapshot, second: Snapshot) -> list[SanityWarning]:
+    """Warnings of registers whose two readings in a row differ."""
+    return [
+        SanityWarning("unstable", name, profile.decode(name, second.raw[name])) for name in first.differing(second.raw)
+    ]
 
 
-def doubts(profile: Profile, snapshot: Snapshot, image: RegisterImage) -> list[Doubt]:
-    """None for a blank device, and none for what looks like a calibration."""
+def sanity_warnings(profile: Profile, snapshot: Snapshot, image: RegisterImage) -> list[SanityWarning]:
+    """Warnings of register values outside their limits, and of a wrong checksum;
+    none for a blank device."""
     if is_blank(snapshot):
         return []
     wanted = {word.register: word.value for word in image.words}
-    found = [doubt for name, raw in snapshot.raw.items() if (doubt := _of(profile, name, raw, wanted))]
+    found = [warning for name, raw in snapshot.raw.items() if (warning := _of(profile, name, raw, wanted))]
     return [*found, *_checksum(profile, snapshot)]
 
 
-def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) -> Doubt | None:
+def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) -> SanityWarning | None:
     value = profile.decode(name, raw)
     if not math.isfinite(value):
-        return Doubt("not_a_number", name, value)
+        return SanityWarning("not_a_number", name, value)
     register = profile.registers[name]
     low = -math.inf if register.minimum is None else register.minimum
     high = math.inf if register.maximum is None else register.maximum
     if not low <= value <= high:
-        return Doubt("outside_limits", name, value, low, high)
+        return SanityWarning("outside_limits", name, value, low, high)
     role = parsed(register.role)
     if role.quantity == SCALE_FACTOR:
         nominal = profile.output.nominal_scale_factor
@@ -235,16 +237,15 @@ def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) ->
     else:
         low, high = BOUNDS.get(role.quantity, (-EFFECT_BOUND, EFFECT_BOUND))
         implausible = role.quantity != CRC_ROLE and not low <= value <= high
-    return Doubt("implausible", name, value, low, high) if implausible else None
+    return SanityWarning("implausible", name, value, low, high) if implausible else None
 
 
 def fits_its_checksum(profile: Profile, snapshot: Snapshot) -> bool:
-    """Whether the device has a checksum, and holds the one that belongs to its
-    registers."""
+    """Whether the device has a checksum, and it matches the registers."""
     return profile.crc is not None and not _checksum(profile, snapshot)
 
 
-def _checksum(profile: Profile, snapshot: Snapshot) -> Sequence[Doubt]:
+def _checksum(profile: Profile, snapshot: Snapshot) -> Sequence[SanityWarning]:
     if profile.crc is None or profile.crc.register_name not in snapshot.raw:
         return []
     name = profile.crc.register_name
@@ -253,7 +254,7 @@ def _checksum(profile: Profile, snapshot: Snapshot) -> Sequence[Doubt]:
         right = float(checksum_of(profile, snapshot.raw))
     except (RegisterValueError, ProfileError, OverflowError, ValueError):  # a register holds no number
         right = math.nan
-    return [] if held == right else [Doubt("checksum", name, held, right, right)]
+    return [] if held == right else [SanityWarning("checksum", name, held, right, right)]
 
 
 # Does a device's corrected output follow its own registers? Values alone, no I/O.
@@ -263,7 +264,7 @@ TOLERANCE_G = 0.01
 bias at least; rounding, and an order of correction other than ours, make ones
 of the size of a product of two small coefficients."""
 LEAST = 3
-"""So few samples or poses say nothing."""
+"""Fewer samples or poses are no evidence."""
 
 
 def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] | None:
@@ -304,16 +305,16 @@ def departure_g(
     return float(np.median(np.linalg.norm(corrected - expected, axis=1)))
 
 
-def doubt_of_departure(off_g: float | None) -> list[Doubt]:
+def departure_warnings(off_g: float | None) -> list[SanityWarning]:
     if off_g is None or off_g <= TOLERANCE_G:
         return []
-    return [Doubt("corrected_output", "", off_g, 0.0, TOLERANCE_G)]
+    return [SanityWarning("corrected_output", "", off_g, 0.0, TOLERANCE_G)]
 
 
 # May the readings be corrected already, by the registers that are to be written?
 
 NAMED = 3
-"""So many registers tell enough."""
+"""Number of registers named in a message."""
 
 
 class ReadingsNotStated(tc.Refused):
@@ -370,7 +371,7 @@ def _is_neutral(profile: Profile, name: str, raw: bytes) -> bool:
 
 
 def _nearest(profile: Profile, name: str, value: float) -> float:
-    """What the register holds for ``value``, which its format may not have."""
+    """Nearest register value to ``value``."""
     try:
         return profile.decode(name, profile.encode(name, value))
     except RegisterValueError:  # outside its limits

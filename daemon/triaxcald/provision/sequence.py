@@ -15,8 +15,8 @@ from triaxcald.provision.access import NO_CONTACT, RegisterLink
 Label = Literal["unlock", "store", "lock", "reset"]
 POLL_S, RETRY_S = 0.02, 0.1
 RECONNECT_S = 5.0
-"""A device that lost its power is back after so long, or somebody has to look
-after it."""
+"""Time for a device to answer again after a loss of power; after that a person has
+to help."""
 
 
 class SequenceStalled(StationError):
@@ -44,7 +44,7 @@ async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Seq
                 restarts = isinstance(following, (WaitStep, ReconnectStep)) and label == "reset"
                 acknowledged &= await _written(link, bundle, step, open_ended=label == "store" or restarts)
             case WaitStep():
-                await link.pace.sleep(step.wait_s)
+                await link.clock.sleep(step.wait_s)
             case PollStep():
                 await _poll(link, bundle.profile, label, step)
             case ReconnectStep():
@@ -53,15 +53,15 @@ async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Seq
 
 
 async def lock_quietly(link: RegisterLink, bundle: Bundle) -> None:
-    """Lock if the device will. A restart locks it too; what it holds does not
-    depend on it."""
+    """Lock the device if it accepts. A restart locks it too, and the stored values do
+    not depend on it."""
     with suppress(DriverError, StationError):
         await run_sequence(link, bundle, "lock")
 
 
 async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_ended: bool) -> bool:
-    """Whether the write was acknowledged; ``open_ended`` where that need not be
-    known."""
+    """Whether the write was acknowledged; with ``open_ended`` a missing
+    acknowledgement is no error."""
     raw = bundle.profile.encode(step.write, step.value)
     try:
         await link.write(step.write, raw, timeout_s=step.timeout_s)
@@ -75,7 +75,7 @@ async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_
 
 
 async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollStep) -> None:
-    deadline_s = link.pace.clock_s() + step.timeout_s
+    deadline_s = link.clock.now_s() + step.timeout_s
     while True:
         try:
             held = profile.decode(step.poll, await link.read_once(step.poll))
@@ -86,11 +86,11 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
             )
             if value == step.until:
                 return
-        except (*NO_CONTACT, RegisterRefused) as e:  # a device at work may be silent, or refuse for now
+        except (*NO_CONTACT, RegisterRefused) as e:  # a busy device may be silent or refuse for a while
             late = e
-        if link.pace.clock_s() >= deadline_s:
+        if link.clock.now_s() >= deadline_s:
             raise late
-        await link.pace.sleep(POLL_S)
+        await link.clock.sleep(POLL_S)
 
 
 def _shown(value: float) -> str:
@@ -105,21 +105,21 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
     One that starts may refuse for a while. At the deadline raises DeviceAbsent,
     DeviceSilent, BusError, RegisterRefused.
     """
-    deadline_s = link.pace.clock_s() + (RECONNECT_S if timeout_s is None else timeout_s)
+    deadline_s = link.clock.now_s() + (RECONNECT_S if timeout_s is None else timeout_s)
     while True:
         await link.close()
         try:
             await link.open()
-            if register := probe(profile):
+            if register := contact_register(profile):
                 await link.read_once(register)
             return
         except (*NO_CONTACT, RegisterRefused):
-            if link.pace.clock_s() >= deadline_s:
+            if link.clock.now_s() >= deadline_s:
                 raise
-        await link.pace.sleep(RETRY_S)
+        await link.clock.sleep(RETRY_S)
 
 
-def probe(profile: Profile) -> str | None:
-    """A register by which a device shows that it is there: opening may succeed
-    on the bus alone."""
+def contact_register(profile: Profile) -> str | None:
+    """The register that proves contact with the device: opening may succeed without
+    a device on the bus."""
     return profile.identity.serial_register or next(iter(profile.identity.expect), None)

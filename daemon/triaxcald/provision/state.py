@@ -1,5 +1,5 @@
-"""What a device holds, and the evidence for it. Values alone: `triaxcald.text`
-puts them into words."""
+"""State of a device's registers, and the evidence for it. Values alone:
+`triaxcald.text` puts them into words."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from enum import StrEnum
 
 
 class DeviceState(StrEnum):
-    """Which calibration the device starts with, as far as anybody can vouch for
-    it."""
+    """The calibration with which the device starts, as far as it is known."""
 
     UNTOUCHED = "untouched"
     """No calibration register was written."""
     OLD = "old"
     """Something was written, and the old calibration is back."""
     NEW_VERIFIED = "new_verified"
-    """All registers read back equal after a restart that took a mark away, or
+    """All registers read back equal after a restart that removed a probe, or
     after the supply was seen off."""
     NEW_UNVERIFIED = "new_unverified"
     """The store was acknowledged and the registers read back equal; no restart
@@ -28,8 +27,8 @@ class DeviceState(StrEnum):
 
 
 class Observation(StrEnum):
-    """What was seen of a device since its registers were last written. Each is
-    kept apart: none stands for another."""
+    """An observation since the last write of the registers. Observations are
+    independent: none implies another."""
 
     ACKNOWLEDGED = "acknowledged"
     """The device acknowledged the store."""
@@ -44,7 +43,7 @@ class Observation(StrEnum):
 
 
 class Evidence(StrEnum):
-    """What the state rests on."""
+    """Evidence for the state of a device."""
 
     NOTHING_WRITTEN = "nothing_written"
     NOTHING_STORED = "nothing_stored"
@@ -52,7 +51,7 @@ class Evidence(StrEnum):
     READ_BACK = "read_back"
     """The registers read back equal, with no restart since they were written."""
     RESTART = "read_after_restart"
-    """All registers were read after a restart that took a mark away."""
+    """All registers were read after a restart that removed a probe."""
     POWER_CYCLE = "read_after_power_cycle"
     """All registers were read after the supply was seen off."""
     WRITE_COUNTER = "write_counter"
@@ -63,8 +62,7 @@ class Evidence(StrEnum):
 
 @dataclass
 class Held:
-    """What the device holds, at any moment: true also when nobody gets to
-    change it any more."""
+    """State of the device at any moment, correct also if the process ends now."""
 
     state: DeviceState = DeviceState.UNTOUCHED
     evidence: Evidence = Evidence.NOTHING_WRITTEN
@@ -78,12 +76,12 @@ class Held:
 
     @property
     def observations(self) -> list[str]:
-        """In the order of `Observation`, for a document."""
+        """Values of the observations in the order of `Observation`, for a document."""
         return [o.value for o in Observation if o in self.observed]
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to be cleared up."""
+        """Whether the state is known and needs no further work."""
         if self.state is DeviceState.OLD:
             return self.evidence is not Evidence.READ_BACK
         return self.state in (DeviceState.UNTOUCHED, DeviceState.NEW_VERIFIED)

@@ -1,5 +1,5 @@
-"""Reads a recording in bounded memory, one chunk at a time, and believes
-nothing that fails its CRC."""
+"""Reads a recording in bounded memory, one chunk at a time, and rejects data that
+fails its CRC."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.contents import Contents, TopicMessage
-from triaxcald.recording.frames import (
+from triaxcald.recording.manifest import is_manifest, load_manifest
+from triaxcald.recording.mcap_records import (
     HEAD,
     MAGIC,
     CutShort,
     Damage,
-    Frame,
     Unpacked,
+    UnparsedRecord,
     check_magic,
     chunk_data,
     chunk_records,
     footer_fits,
-    frame_at,
     parse,
     size_of,
+    unparsed_at,
     walk,
     written_to,
 )
-from triaxcald.recording.manifest import is_manifest, load_manifest
 
 METADATA_MOST = 2**20  # bytes; ours has some hundred
 ATTACHMENTS_MOST = 1000  # a run leaves a dozen
 
 
 class Attachments(Mapping[str, bytes]):
-    """Attachments by name; each is read from the file when it is asked for."""
+    """Attachments by name; each is read from the file on access."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -54,7 +54,7 @@ class Attachments(Mapping[str, bytes]):
         self.sizes[attachment.name] = len(attachment.data)
 
     def __getitem__(self, name: str) -> bytes:
-        record = parse(self._recording.frame(self._offsets[name]), self._recording.name)
+        record = parse(self._recording.unparsed(self._offsets[name]), self._recording.name)
         assert isinstance(record, Attachment)
         return record.data
 
@@ -83,11 +83,11 @@ class Recording(Contents):
         self._stream = stream
         self._chunks: list[int] = []
         self._known: dict[int, tuple[frozenset[str], dict[int, str]]] = {}
-        """Of a chunk that was read to its end: the topics of its messages, and
-        the channels that it declares."""
+        """By chunk that was read to its end: topics of its messages, and channels that
+        it declares."""
         self._topics: dict[int, str] = {}
         self._said = 0  # bytes of metadata
-        self._unconfirmed: int | None = None  # the running index from which on raw records are so
+        self._unconfirmed: int | None = None  # running index of the first unconfirmed raw record
         self.size = size_of(stream)
         if not self.size:
             raise RecordingError(f"{name}: the file is empty; nothing was recorded")
@@ -119,8 +119,8 @@ class Recording(Contents):
         return recording
 
     def _heed_manifest(self, path: Path) -> None:
-        """Of a segment that was closed before another unit was noticed, the
-        manifest beside it says which records are unconfirmed."""
+        """Take the unconfirmed records from the manifest beside the segment, which may
+        have been closed before an exchange of the unit was noticed."""
         own = self.metadata.get(schema.SEGMENT_RECORD, {})
         of = own.get("of", "")
         if not is_manifest(of) or Path(of).name != of:
@@ -167,89 +167,87 @@ class Recording(Contents):
                         yield TopicMessage(found, record)
             self._known[offset] = frozenset(seen), channels
 
-    def frames(self) -> Iterator[Frame]:
-        """Every record of the file in its order, as bytes."""
+    def unparsed_records(self) -> Iterator[UnparsedRecord]:
+        """Every record of the file in order, unparsed."""
         return walk(self._stream, self.name, self.size)
 
     def _records(self, offset: int) -> Iterator[Schema | Channel | Message]:
-        """Of the chunk at ``offset``."""
-        data = chunk_data(self.frame(offset), self.name)
+        """Records of the chunk at ``offset``."""
+        data = chunk_data(self.unparsed(offset), self.name)
         try:
             yield from chunk_records(data)
         except Damage as e:
             raise Damage(self.name, offset, e.what) from e
 
-    def frame(self, offset: int) -> Frame:
+    def unparsed(self, offset: int) -> UnparsedRecord:
         try:
-            return frame_at(self._stream, self.name, offset, self.size)
+            return unparsed_at(self._stream, self.name, offset, self.size)
         except OSError as e:
             raise RecordingError(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
 
     def _survey(self) -> None:
-        """Notes where everything is and checks the two CRCs that together cover
-        every byte."""
+        """Index the file, and check the two CRCs that together cover every byte."""
         crc = zlib.crc32(MAGIC)
         unpacked = Unpacked(self.name, self.size)
-        for frame in walk(self._stream, self.name, self.size):
-            if frame.opcode == Opcode.CHUNK:
-                unpacked.chunk(frame)
-                if frame.end > self._written:
-                    chunk_data(frame, self.name)
-            self._note(frame)
-            if frame.opcode == Opcode.DATA_END:
-                self._check_data(frame, crc)
+        for unparsed in walk(self._stream, self.name, self.size):
+            if unparsed.opcode == Opcode.CHUNK:
+                unpacked.chunk(unparsed)
+                if unparsed.end > self._written:
+                    chunk_data(unparsed, self.name)
+            self._note(unparsed)
+            if unparsed.opcode == Opcode.DATA_END:
+                self._check_data(unparsed, crc)
                 crc = 0
-            elif frame.opcode == Opcode.FOOTER:
-                self._check_end(frame, crc)
+            elif unparsed.opcode == Opcode.FOOTER:
+                self._check_end(unparsed, crc)
             else:
-                crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
+                crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
 
     def _reaches_zeros(self, offset: int) -> bool:
-        """Whether the record that begins there was not wholly written before
-        the zeros that the file ends with."""
+        """Whether the record at ``offset`` reaches into the zeros at the end."""
         if self._written == self.size:
             return False
-        return offset + HEAD.size > self._written or self.frame(offset).end > self._written
+        return offset + HEAD.size > self._written or self.unparsed(offset).end > self._written
 
-    def _note(self, frame: Frame) -> None:
-        if frame.opcode == Opcode.CHUNK:
-            self._chunks.append(frame.offset)
+    def _note(self, unparsed: UnparsedRecord) -> None:
+        if unparsed.opcode == Opcode.CHUNK:
+            self._chunks.append(unparsed.offset)
             return
-        record = parse(frame, self.name)
+        record = parse(unparsed, self.name)
         if isinstance(record, Header) and record.profile != schema.PROFILE:
             raise RecordingError(
                 f"{self.name}: an MCAP file, but not a recording of triaxcal: its header says profile"
                 f" '{record.profile}', expected '{schema.PROFILE}'"
             )
         if isinstance(record, Metadata):
-            self._said += len(frame.body)
+            self._said += len(unparsed.body)
             if self._said > METADATA_MOST:
                 raise RecordingError(f"{self.name}: more than {METADATA_MOST} bytes of metadata")
             self.metadata.setdefault(record.name, {}).update(record.metadata)
         elif isinstance(record, Attachment):
             if len(self.attachments) >= ATTACHMENTS_MOST:
                 raise RecordingError(f"{self.name}: more than {ATTACHMENTS_MOST} attachments")
-            self.attachments.add(frame.offset, record)
+            self.attachments.add(unparsed.offset, record)
         elif isinstance(record, Channel):
             self._topics[record.id] = record.topic
 
-    def _check_data(self, frame: Frame, crc: int) -> None:
-        record = parse(frame, self.name)
+    def _check_data(self, unparsed: UnparsedRecord, crc: int) -> None:
+        record = parse(unparsed, self.name)
         assert isinstance(record, DataEnd)
         if record.data_section_crc in (0, crc):
             return
         for number, offset in enumerate(self._chunks, start=1):
             try:
-                chunk_data(self.frame(offset), self.name)
+                chunk_data(self.unparsed(offset), self.name)
             except Damage as e:
                 raise Damage(self.name, offset, f"chunk {number} of {self.chunks}: {e.what}") from e
-        raise Damage(self.name, frame.offset, "header, metadata or index records fail the CRC checked")
+        raise Damage(self.name, unparsed.offset, "header, metadata or index records fail the CRC checked")
 
-    def _check_end(self, frame: Frame, crc: int) -> None:
-        if not footer_fits(frame, crc):
-            raise Damage(self.name, frame.offset, "the summary fails its CRC checked")
-        self._stream.seek(frame.end)
+    def _check_end(self, unparsed: UnparsedRecord, crc: int) -> None:
+        if not footer_fits(unparsed, crc):
+            raise Damage(self.name, unparsed.offset, "the summary fails its CRC checked")
+        self._stream.seek(unparsed.end)
         tail = self._stream.read(len(MAGIC) + 1)
         if tail != MAGIC:
             kind = CutShort if MAGIC.startswith(tail) else Damage
-            raise kind(self.name, frame.end, "the file does not end as it should")
+            raise kind(self.name, unparsed.end, "the file does not end as it should")

@@ -27,19 +27,19 @@ from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
 from triaxcald.files import unused
 from triaxcald.recording import schema
-from triaxcald.recording.frames import (
+from triaxcald.recording.manifest import Manifest, Segment, State, numbered_files, parsed_manifest
+from triaxcald.recording.mcap_records import (
     HEAD,
     MAGIC,
     check_magic,
     chunk_data,
     chunk_records,
     footer_fits,
-    frame_at,
     parse,
     size_of,
+    unparsed_at,
     written_to,
 )
-from triaxcald.recording.manifest import Manifest, Segment, State, numbered_files, parsed_manifest
 from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.series import digest_of
@@ -255,15 +255,15 @@ def _told(path: Path) -> Told | None:
         size, offset = size_of(stream), len(MAGIC)
         # The metadata stand before the first chunk.
         while offset < size:
-            frame = frame_at(stream, str(path), offset, size)
-            if frame.opcode == Opcode.METADATA:
-                record = parse(frame, str(path))
+            unparsed = unparsed_at(stream, str(path), offset, size)
+            if unparsed.opcode == Opcode.METADATA:
+                record = parse(unparsed, str(path))
                 assert isinstance(record, MetadataRecord)
                 if record.name == schema.SEGMENT_RECORD:
                     return dict(record.metadata)
-            if frame.opcode in (Opcode.CHUNK, Opcode.DATA_END):
+            if unparsed.opcode in (Opcode.CHUNK, Opcode.DATA_END):
                 return {}
-            offset = frame.end
+            offset = unparsed.end
     return None
 
 
@@ -286,7 +286,7 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
             summary = _summary(stream, name, size)
             if summary is None or schema.RAW_RECORD not in summary.metadata or schema.UNCONFIRMED in summary.metadata:
                 return None
-            record = parse(frame_at(stream, name, summary.metadata[schema.RAW_RECORD], size), name)
+            record = parse(unparsed_at(stream, name, summary.metadata[schema.RAW_RECORD], size), name)
             counts = {summary.channels.get(i): n for i, n in summary.statistics.channel_message_counts.items()}
             if not isinstance(record, MetadataRecord) or counts.get(schema.LOSS, 0):
                 return None
@@ -309,7 +309,7 @@ def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
     stream.seek(size - len(MAGIC))
     if footer_at < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
         return None
-    footer = frame_at(stream, name, footer_at, size)
+    footer = unparsed_at(stream, name, footer_at, size)
     if footer.opcode != Opcode.FOOTER or footer.end != size - len(MAGIC):
         return None
     end = parse(footer, name)
@@ -318,11 +318,11 @@ def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
     if not len(MAGIC) <= offset < footer_at:
         return None
     while offset < footer_at:
-        frame = frame_at(stream, name, offset, size)
-        crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
-        if frame.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
-            records.append(parse(frame, name))
-        offset = frame.end
+        unparsed = unparsed_at(stream, name, offset, size)
+        crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
+        if unparsed.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
+            records.append(parse(unparsed, name))
+        offset = unparsed.end
     statistics = [r for r in records if isinstance(r, Statistics)]
     if offset != footer_at or not footer_fits(footer, crc) or not statistics:
         return None
@@ -340,7 +340,7 @@ def _span_ns(stream: BinaryIO, name: str, size: int, summary: _Summary) -> tuple
     chunks = [chunk for chunk in summary.chunks if raw & set(chunk.message_index_offsets)]
     times = list[int]()
     for offset in dict.fromkeys(chunk.chunk_start_offset for chunk in chunks[:1] + chunks[-1:]):
-        for record in chunk_records(chunk_data(frame_at(stream, name, offset, size), name)):
+        for record in chunk_records(chunk_data(unparsed_at(stream, name, offset, size), name)):
             if isinstance(record, Message) and record.channel_id in raw:
                 _, _, batch = decode_raw(record.data)
                 times += batch.time_ns.tolist()

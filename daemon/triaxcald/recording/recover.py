@@ -20,27 +20,27 @@ from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
 from triaxcald.files import exists_already, new_file
 from triaxcald.recording import schema
-from triaxcald.recording.frames import (
+from triaxcald.recording.manifest import is_manifest
+from triaxcald.recording.mcap_records import (
     CHUNK_LIMIT,
     HEAD,
     MAGIC,
     CutShort,
     Damage,
-    Frame,
     Unpacked,
+    UnparsedRecord,
     check_magic,
     chunk_data,
     chunk_head,
     chunk_records,
     footer_fits,
-    frame_at,
     parse,
     size_of,
     unpack,
     unpack_part,
+    unparsed_at,
     whole_chunk_head,
 )
-from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.raw_batch import decode_raw
 
 # What can still be found in a damaged file: its readable records in order and the
@@ -83,7 +83,7 @@ class DamagedFile:
         self._unpacked = Unpacked(name, self.size)
         self._look_ahead()
 
-    def pieces(self) -> Iterator[Frame | Stretch]:
+    def pieces(self) -> Iterator[UnparsedRecord | Stretch]:
         """Up to the end of the data and with it, or to the end of the file
         where that is missing.
 
@@ -92,16 +92,16 @@ class DamagedFile:
         offset = len(MAGIC)
         while offset < self.size:
             try:
-                frame = frame_at(self._source, self.name, offset, self.size)
-                self._vet(frame)
+                unparsed = unparsed_at(self._source, self.name, offset, self.size)
+                self._vet(unparsed)
             except Damage:
                 following = self._search(offset + 1)
                 yield Stretch(offset, following - offset, following >= self.size)
                 offset = following
                 continue
-            yield frame
-            offset = frame.end
-            if frame.opcode == Opcode.DATA_END:
+            yield unparsed
+            offset = unparsed.end
+            if unparsed.opcode == Opcode.DATA_END:
                 return
 
     def read(self, offset: int, length: int) -> bytes:
@@ -115,12 +115,12 @@ class DamagedFile:
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
 
-    def _vet(self, frame: Frame) -> None:
+    def _vet(self, unparsed: UnparsedRecord) -> None:
         """Raises Damage where the record's length cannot be right."""
-        if frame.opcode == Opcode.CHUNK:
-            whole_chunk_head(frame, self.name)
-        elif frame.opcode != Opcode.ATTACHMENT:
-            parse(frame, self.name)
+        if unparsed.opcode == Opcode.CHUNK:
+            whole_chunk_head(unparsed, self.name)
+        elif unparsed.opcode != Opcode.ATTACHMENT:
+            parse(unparsed, self.name)
 
     def _search(self, offset: int) -> int:
         """Where the next record begins that proves itself, from ``offset`` on;
@@ -138,12 +138,12 @@ class DamagedFile:
         if self._tried > _TRIED_MOST * self.size + _TRIED_LEAST:
             raise RecordingError(f"{self.name}: too much of it looks like records and is none")
         try:
-            frame = frame_at(self._source, self.name, offset, self.size)
-            self._tried += len(frame.body)
-            if frame.opcode == Opcode.CHUNK:
-                chunk_data(frame, self.name)
+            unparsed = unparsed_at(self._source, self.name, offset, self.size)
+            self._tried += len(unparsed.body)
+            if unparsed.opcode == Opcode.CHUNK:
+                chunk_data(unparsed, self.name)
             else:
-                parse(frame, self.name)
+                parse(unparsed, self.name)
         except Damage:
             return False
         return True
@@ -154,7 +154,7 @@ class DamagedFile:
         profile: str | None = None
         ours = False
         for piece in self.pieces():
-            if not isinstance(piece, Frame):
+            if not isinstance(piece, UnparsedRecord):
                 continue
             if piece.opcode == Opcode.CHUNK:
                 self._unpacked.chunk(piece)
@@ -176,15 +176,15 @@ class DamagedFile:
         what the chunks say."""
         records, crc = [], 0
         try:
-            frame = frame_at(self._source, self.name, offset, self.size)
-            while frame.opcode != Opcode.FOOTER:
-                records.append(parse(frame, self.name))
-                crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
-                frame = frame_at(self._source, self.name, frame.end, self.size)
-            parse(frame, self.name)
+            unparsed = unparsed_at(self._source, self.name, offset, self.size)
+            while unparsed.opcode != Opcode.FOOTER:
+                records.append(parse(unparsed, self.name))
+                crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
+                unparsed = unparsed_at(self._source, self.name, unparsed.end, self.size)
+            parse(unparsed, self.name)
         except Damage:
             return
-        if footer_fits(frame, crc):
+        if footer_fits(unparsed, crc):
             for record in records:
                 self.declare(record)
 
@@ -278,21 +278,21 @@ class _Mending:
                 self._data_end(piece, crc)
             else:
                 crc = zlib.crc32(piece.body, zlib.crc32(piece.head, crc))
-                self._frame(piece)
+                self._unparsed(piece)
         self._count_missing()
         self._write_end(name)
         return self._recovery
 
-    def _frame(self, frame: Frame) -> None:
+    def _unparsed(self, unparsed: UnparsedRecord) -> None:
         try:
-            if frame.opcode == Opcode.CHUNK:
-                self._records(chunk_data(frame, self._damaged.name))
+            if unparsed.opcode == Opcode.CHUNK:
+                self._records(chunk_data(unparsed, self._damaged.name))
                 return
-            record = parse(frame, self._damaged.name)
+            record = parse(unparsed, self._damaged.name)
         except Damage:
             self._located = True
-            self._recovery.bytes_dropped += frame.end - frame.offset
-            if frame.opcode == Opcode.CHUNK:
+            self._recovery.bytes_dropped += unparsed.end - unparsed.offset
+            if unparsed.opcode == Opcode.CHUNK:
                 self._recovery.chunks_failed += 1
             else:
                 self._recovery.attachments_failed += 1
@@ -397,9 +397,9 @@ class _Mending:
                 self._recovery.raw_dropped += loss.records
                 self._raw_end = max(self._raw_end, loss.first + loss.records)
 
-    def _data_end(self, frame: Frame, crc: int) -> None:
+    def _data_end(self, unparsed: UnparsedRecord, crc: int) -> None:
         self._recovery.cut_short = False
-        record = parse(frame, self._damaged.name)
+        record = parse(unparsed, self._damaged.name)
         assert isinstance(record, DataEnd)
         wrong = record.data_section_crc not in (0, crc)
         self._recovery.unlocated_damage = wrong and not self._located

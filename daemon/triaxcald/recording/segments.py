@@ -52,7 +52,7 @@ _SUFFIX = ".mcap"
 _IS_HEX = np.isin(np.arange(256), np.frombuffer(b"0123456789abcdef", dtype=np.uint8))
 
 
-class Evidence(NamedTuple):
+class RetainedFiles(NamedTuple):
     """``kept`` are files that stay; ``unread`` is the document, or the folder,
     that may name any of them."""
 
@@ -120,7 +120,7 @@ class EvidenceIndex:
     _all: _All = field(default_factory=_All)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def of(self, manifest: Manifest) -> Evidence:
+    def of(self, manifest: Manifest) -> RetainedFiles:
         """The files that an outcome or a certificate beside the manifest names,
         by name or by digest; all, where such a document cannot be read, and
         which that is."""
@@ -129,7 +129,7 @@ class EvidenceIndex:
             try:
                 unread = self._look()
                 if unread is not None:
-                    return Evidence(every, unread)
+                    return RetainedFiles(every, unread)
                 texts = self._texts(name for name, (_, names) in self._known.items() if names is None)
                 kept = {s.file for s in manifest.segments if self._all.names(s) or _is_in(s, texts)}
                 odd = [s for s in manifest.segments if s.file not in kept and not _is_indexed(s)]
@@ -137,8 +137,8 @@ class EvidenceIndex:
                     texts = self._texts(self._known)
                     kept |= {s.file for s in odd if _is_in(s, texts)}
             except _Unread as e:
-                return Evidence(every, str(e))
-            return Evidence(frozenset(kept))
+                return RetainedFiles(every, str(e))
+            return RetainedFiles(frozenset(kept))
 
     def _look(self) -> str | None:
         """Brings the index up to date; what cannot be read, if anything."""

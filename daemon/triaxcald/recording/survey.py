@@ -25,7 +25,7 @@ from mcap.records import (
 )
 
 from triaxcald.recording import schema
-from triaxcald.recording.frames import HEAD, Frame, chunk_data, chunk_records, parse, whole_chunk_head
+from triaxcald.recording.mcap_records import HEAD, UnparsedRecord, chunk_data, chunk_records, parse, whole_chunk_head
 from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.retention import Inventory
@@ -88,16 +88,16 @@ class _Surveying:
         self._chunk: ChunkIndex | None = None
 
     def run(self) -> Survey:
-        summary: list[tuple[Frame, Any]] = []
+        summary: list[tuple[UnparsedRecord, Any]] = []
         ended = False
-        for frame in self._recording.frames():
+        for unparsed in self._recording.unparsed_records():
             if ended:
-                summary.append((frame, parse(frame, self._recording.name)))
-            elif frame.opcode == Opcode.DATA_END:
+                summary.append((unparsed, parse(unparsed, self._recording.name)))
+            elif unparsed.opcode == Opcode.DATA_END:
                 self._close_chunk()
                 ended = True
             else:
-                self._data(frame)
+                self._data(unparsed)
         self._check_summary(summary)
         for names in (self._found.attachments, self._metadata):
             for name, count in Counter(names).items():
@@ -105,27 +105,27 @@ class _Surveying:
         self._found.faults += [Fault(kind, part, n) for (kind, part), n in self._counts.items() if n]
         return self._found
 
-    def _data(self, frame: Frame) -> None:
-        if frame.opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(frame)
+    def _data(self, unparsed: UnparsedRecord) -> None:
+        if unparsed.opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(unparsed)
             return
         self._close_chunk()
-        if frame.opcode == Opcode.CHUNK:
-            self._records(frame)
+        if unparsed.opcode == Opcode.CHUNK:
+            self._records(unparsed)
             return
-        record = parse(frame, self._recording.name)
-        length = frame.end - frame.offset
+        record = parse(unparsed, self._recording.name)
+        length = unparsed.end - unparsed.offset
         if isinstance(record, Attachment):
             self._attachment(record)
             self._indices.append(
                 AttachmentIndex(
-                    offset=frame.offset, length=length, create_time=record.create_time, log_time=record.log_time,
+                    offset=unparsed.offset, length=length, create_time=record.create_time, log_time=record.log_time,
                     data_size=len(record.data), name=record.name, media_type=record.media_type,
                 )
             )  # fmt: skip
         elif isinstance(record, Metadata):
             self._metadata.append(record.name)
-            self._indices.append(MetadataIndex(offset=frame.offset, length=length, name=record.name))
+            self._indices.append(MetadataIndex(offset=unparsed.offset, length=length, name=record.name))
             if record.name not in AFTER_THE_END:
                 self._found.inventory.metadata(record.name, record.metadata)
 
@@ -138,11 +138,12 @@ class _Surveying:
 
     # Chunks and what they hold.
 
-    def _records(self, frame: Frame) -> None:
-        name, head = self._recording.name, whole_chunk_head(frame, self._recording.name)
-        data = chunk_data(frame, name)
+    def _records(self, unparsed: UnparsedRecord) -> None:
+        name, head = self._recording.name, whole_chunk_head(unparsed, self._recording.name)
+        data = chunk_data(unparsed, name)
         self._chunk = ChunkIndex(
-            chunk_length=frame.end - frame.offset, chunk_start_offset=frame.offset, compression=head.compression,
+            chunk_length=unparsed.end - unparsed.offset, chunk_start_offset=unparsed.offset,
+            compression=head.compression,
             compressed_size=len(head.data), message_end_time=head.message_end_time, message_index_length=0,
             message_index_offsets={}, message_start_time=head.message_start_time,
             uncompressed_size=head.uncompressed_size,
@@ -207,16 +208,16 @@ class _Surveying:
 
     # Indices.
 
-    def _message_index(self, frame: Frame) -> None:
-        channel_id, length = _INDEX_HEAD.unpack_from(frame.body)
-        held = frame.body[_INDEX_HEAD.size :]
+    def _message_index(self, unparsed: UnparsedRecord) -> None:
+        channel_id, length = _INDEX_HEAD.unpack_from(unparsed.body)
+        held = unparsed.body[_INDEX_HEAD.size :]
         size = _INDEX_ENTRY.size
         entries = b"".join(sorted(held[i : i + size] for i in range(0, len(held), size)))
         if len(held) != length or self._chunk is None or self._expected.pop(channel_id, None) != entries:
             self._counts["index", "messages"] += 1
         if self._chunk is not None:
-            self._chunk.message_index_offsets[channel_id] = frame.offset
-            self._chunk.message_index_length += frame.end - frame.offset
+            self._chunk.message_index_offsets[channel_id] = unparsed.offset
+            self._chunk.message_index_length += unparsed.end - unparsed.offset
 
     def _close_chunk(self) -> None:
         if self._chunk is not None:
@@ -224,17 +225,17 @@ class _Surveying:
             self._indices.append(self._chunk)
         self._chunk, self._expected = None, {}
 
-    def _check_summary(self, summary: list[tuple[Frame, Any]]) -> None:
+    def _check_summary(self, summary: list[tuple[UnparsedRecord, Any]]) -> None:
         wanted = [*self._schemas.values(), *self._channels.values(), self._statistics(), *self._indices]
         groups: dict[int, tuple[int, int]] = {}
         offsets: list[tuple[int, int, int]] = []
         found = []
-        for frame, record in summary:
+        for unparsed, record in summary:
             if isinstance(record, SummaryOffset):
                 offsets.append((record.group_opcode, record.group_start, record.group_length))
             elif not isinstance(record, Footer):
-                start, length = groups.get(frame.opcode, (frame.offset, 0))
-                groups[frame.opcode] = start, length + frame.end - frame.offset
+                start, length = groups.get(unparsed.opcode, (unparsed.offset, 0))
+                groups[unparsed.opcode] = start, length + unparsed.end - unparsed.offset
                 found.append(record)
         for kind in (Schema, Channel, Statistics, ChunkIndex, AttachmentIndex, MetadataIndex):
             has, should = ([r for r in some if isinstance(r, kind)] for some in (found, wanted))

@@ -1,5 +1,4 @@
-"""Writes a recording, on a thread of its own so that no disk ever holds up a
-bus."""
+"""Writes a recording on a thread of its own, so that no disk delays a bus."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
-from triaxcald.abort import Left, add_action, discard_action
+from triaxcald.abort import AbortNotice, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.files import require_new
 from triaxcald.memory import ran_out_of_memory
@@ -24,12 +23,12 @@ from triaxcald.recording.file import ENDED, SYNC_S, EndedBecause, Head, Recordin
 from triaxcald.recording.retention import Document
 
 LOOK_S = 1.0
-"""A writer that is given nothing looks about so often, since a segment grows old
-in silence too; sooner where what was written is due to the operating system."""
+"""Period in which an idle writer checks the age of its segment; earlier if written data
+is due for the operating system."""
 
 BEHIND_S = 5.0
-"""A disk that is a little slower than the bus costs a batch now and then: so
-long after the last it is said to keep up again."""
+"""Time after the last lost batch until the disk counts as fast enough again: a slightly
+slow disk loses a batch now and then."""
 
 
 class RecordingWriter:
@@ -75,7 +74,7 @@ class RecordingWriter:
         self._provisional = provisional
         self.losses: dict[str, int] = {}
         self.warning: str | None = None
-        """What was wrong with the earlier recording that it goes on behind."""
+        """Fault of the earlier recording that this one continues."""
         self.ends_with = ends_with
         self._clock_ns, self._sync_s, self._waits = clock_ns, sync_s, waits
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
@@ -89,8 +88,8 @@ class RecordingWriter:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._file = self._begin(Head(metadata, preview_channels, preview_unit, ends_with, of_the_past))
         self._offered = self._file.raw_end
-        # A caller that dies without closing must not be kept alive by it; `log
-        # recover` finishes the file.
+        # The thread must not keep a failed process alive; `log recover` finishes the
+        # file.
         self._thread = threading.Thread(target=self._run, name=f"recording {path.name}", daemon=True)
         self._thread.start()
         add_action(self, self._finish_at_abort)
@@ -103,35 +102,34 @@ class RecordingWriter:
 
     @property
     def current(self) -> Path:
-        """The file that is being written."""
+        """Path of the file being written."""
         return self._file.path
 
     @property
     def queued(self) -> int:
-        """How much waits for the disk: batches, blocks and events."""
+        """Number of batches, blocks and events that wait for the disk."""
         return self._jobs.qsize()
 
     @property
     def keeps_for(self) -> str | None:
-        """A document that keeps retention from deleting anything, as it cannot
-        be read."""
+        """An unreadable document, because of which retention deletes nothing."""
         return None
 
     @property
     def is_behind(self) -> bool:
-        """Whether raw records are being lost since the disk does not keep up:
-        some were within `BEHIND_S`, or the disk has not got on since."""
+        """Whether the disk is too slow: raw records were lost within `BEHIND_S`, or the
+        disk has made no progress since."""
         hangs = any(topic == schema.RAW for topic, _, _ in self._unreported)
         return hangs or time.monotonic() - self._dropped_s < BEHIND_S
 
     @property
     def resumes(self) -> Gap | None:
-        """What was not recorded before this writer began, where it goes on
-        behind earlier records; not over yet."""
+        """The open gap before this writer's first record, if it continues an earlier
+        recording."""
         return None
 
     def raw(self, phase: str, batch: RawBatch) -> bool:
-        """Whether there was room for the batch."""
+        """Hand over a batch; False if the queue is full and it is dropped."""
         self.check()
         with self._order:
             first = self._offered
@@ -139,8 +137,8 @@ class RecordingWriter:
             return self._offer(schema.RAW, first, len(batch), partial(self._write_raw, phase, first, batch))
 
     def preview(self, topic: schema.PreviewTopic, block: SampleBlock) -> bool:
-        """Keeps the block's samples at the preview rate; whether there was room
-        for them."""
+        """Hand over the block's samples at the preview rate; False if the queue is full
+        and they are dropped."""
         self.check()
         with self._order:
             picked = self._decimators[topic].pick(block)
@@ -156,21 +154,23 @@ class RecordingWriter:
         self._jobs.put(partial(self._write, schema.REGISTERS, access))
 
     def event(self, kind: str, detail: Mapping[str, Any] | None = None) -> None:
-        """``detail`` goes in as JSON."""
+        """Write an event; ``detail`` is stored as JSON."""
         self.check()
         event = schema.Event(self._clock_ns(), kind, json.dumps(dict(detail or {}), sort_keys=True))
         self._jobs.put(partial(self._write, schema.EVENTS, event))
 
     @property
     def offered(self) -> int:
-        """The running index after the last raw record that was given to it."""
+        """Running index after the last raw record handed over."""
         return self._offered
 
     def unconfirmed(self, first: int, detail: Mapping[str, Any]) -> None:
-        """All raw records from the running index ``first`` on are unconfirmed:
-        another unit than the one that is recorded answered later. Said by a
-        metadata record, which a reader finds without unpacking the messages,
-        and by an event with ``detail``. No raw record may follow."""
+        """Mark the raw records from the running index ``first`` on as unconfirmed,
+        because another unit answered later.
+
+        A metadata record states it, which a reader finds without unpacking messages,
+        and an event with ``detail``. No raw record may follow.
+        """
         self.check()
         told = {"first": str(first), "end": str(self._offered)}
         self._jobs.put(partial(self._write_unconfirmed, first, told))
@@ -184,8 +184,8 @@ class RecordingWriter:
         self._jobs.put(partial(self._write_attachment, self._clock_ns(), name, media_type, data))
 
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
-        """The last attachment, made from the inventory of all that is in the
-        file before it; closes the recording."""
+        """Write the last attachment, made from the inventory of the file before it, and
+        close the recording."""
         self.check()
         time_ns = self._clock_ns()
 
@@ -197,7 +197,7 @@ class RecordingWriter:
         self.close()
 
     def drain(self) -> None:
-        """Waits until the operating system has all that was given before."""
+        """Wait until the operating system has all earlier data."""
         self.check()
         done = threading.Event()
         self._jobs.put(self._flush)
@@ -213,7 +213,7 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Bytes that are in the file."""
+        """Size of the file in bytes."""
         return self._file.size
 
     @property
@@ -221,8 +221,8 @@ class RecordingWriter:
         return self._closed
 
     def close(self, because: EndedBecause | None = None) -> None:
-        """Writes what is waiting, the indexes and the end of the file, and
-        before them the event that says why, where that is given."""
+        """Write the waiting data, an event with the reason ``because`` if given, the
+        indexes and the end of the file."""
         if not self._closed:
             if because is not None and self._failure is None:
                 self.event(ENDED, {"reason": because})
@@ -233,15 +233,15 @@ class RecordingWriter:
         if self._failure is not None:
             raise self._failure
 
-    def _finish_at_abort(self, until_s: float) -> Left | None:
+    def _finish_at_abort(self, until_s: float) -> AbortNotice | None:
         self._closed = True
         self._jobs.put(None)
         self._thread.join(max(0.0, until_s - time.monotonic()))
         if self._provisional:
             return None
         if self._thread.is_alive():
-            return Left(f"{self._told} is not finished; triaxcal log recover mends it")
-        return Left(str(self._failure) if self._failure else f"{self._told} is finished")
+            return AbortNotice(f"{self._told} is not finished; triaxcal log recover mends it")
+        return AbortNotice(str(self._failure) if self._failure else f"{self._told} is finished")
 
     def __enter__(self) -> Self:
         return self
@@ -254,15 +254,15 @@ class RecordingWriter:
         except RecordingError as e:
             if value is None:
                 raise
-            value.add_note(str(e))  # what is on its way already weighs more
+            value.add_note(str(e))  # the current error has priority
 
     @property
     def _told(self) -> Path:
-        """The file that messages name."""
+        """The file named in messages."""
         return self.path
 
     def _leave(self, error: BaseException | None) -> None:
-        """Closes it, left as a context manager with ``error``."""
+        """Close at the end of the context, which ``error`` ended."""
         self.close()
 
     def check(self) -> None:
@@ -290,7 +290,7 @@ class RecordingWriter:
             self.check()
         return True
 
-    # What follows runs on the writer's thread.
+    # The methods below run on the writer's thread.
 
     def _run(self) -> None:
         try:
@@ -330,7 +330,7 @@ class RecordingWriter:
                 self._idle()
 
     def _idle(self) -> None:
-        """Nothing has come for `LOOK_S`."""
+        """Check file and segment after `LOOK_S` without a job."""
         self._file.require_there()
         self._look_after()
         self._flushed()
@@ -348,7 +348,7 @@ class RecordingWriter:
             self._end_for_lack_of_room(free)
 
     def _end_for_lack_of_room(self, free: int) -> None:
-        """Raises DiskError."""
+        """End the recording because of a full disk. Raises DiskError."""
         detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
         self._file.write(schema.EVENTS, schema.Event(self._file.told_ns, ENDED, detail))
         self._finish()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcald.doubts import is_passing
+from triaxcald.caveats import is_passing
 from triaxcald.report.figures import clean, micro_g, number
 from triaxcald.report.meanings import QUALITY
 

@@ -14,8 +14,8 @@ from markupsafe import Markup
 import triaxcal as tc
 from triaxcal_drivers.roles import LINEAR
 from triaxcald import text
+from triaxcald.caveats import assumption
 from triaxcald.certificate import Certified
-from triaxcald.doubts import assumption
 from triaxcald.outcome import Ending
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.state import Held

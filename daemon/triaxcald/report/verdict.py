@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import triaxcal as tc
-from triaxcald.doubts import HOST, PROCESS, REGISTERS, doubts_of, none_could_show
+from triaxcald.caveats import HOST, PROCESS, REGISTERS, none_could_show, unit_questions
 from triaxcald.report.document import (
     CANDIDATE,
     Device,
@@ -99,7 +99,7 @@ def judge(
     if outcome.held_out is not None and outcome.held_out.contradicts and found.kind != "refused":
         kind: Kind = "unexplained" if found.kind == "within" else found.kind
         found = replace(found, kind=kind, headline=f"{_CONTRADICTED}; {found.headline[:1].lower()}{found.headline[1:]}")
-    if not (doubts := doubts_of(outcome.doubts)):
+    if not (doubts := unit_questions(outcome.doubts)):
         return found
     kind = "unexplained" if found.kind == "within" else found.kind
     return replace(found, kind=kind, headline="; ".join([found.headline, *doubts]))

@@ -1,5 +1,4 @@
-"""How work ends: the verdict, the exit code it owes, and the reason in one
-line."""
+"""Endings of a run: verdict, exit code, and the reason in one line."""
 
 from __future__ import annotations
 
@@ -43,9 +42,8 @@ from triaxcald.verification import WORSE
 
 
 def judged(certificate: tc.interchange.Document, verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
-    """The verdict on the figures: on those of the fit in the ``certificate``,
-    and on the device's own output if it was written. Nothing else enters, so
-    that an audit finds the same."""
+    """Verdict on the figures of the fit in the ``certificate``, and on the device's
+    own output if it was written. Nothing else enters, so an audit gives the same."""
     if outside := certificate["outside"]:
         names = exceeded(certificate["result"]["after"], limits)
         only_cross_validated = names == ["cross_validated_rms_g"]
@@ -62,8 +60,11 @@ def judged(certificate: tc.interchange.Document, verification: Mapping[str, Any]
 
 
 def aborted(e: BaseException, p: Provisioning | None) -> Ending:
-    """Once registers were written any error is one of the device, unless it is
-    settled and only the disk failed or somebody interrupted."""
+    """Ending of a run that raised ``e``.
+
+    Once registers were written, every error counts as one of the device, unless the
+    device is settled and only the disk failed or the run was interrupted.
+    """
     exit_code, code = exit_code_of(e), code_of(e)
     if (trace := trace_of(e)) is not None:
         with suppress(OSError, ValueError):  # a closed standard error
@@ -78,12 +79,12 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
 
 
 _WHO_IS_THERE = (Code.WRONG_UNIT, Code.TWO_ANSWER)
-"""Codes that say more than that the device is not settled."""
+"""Codes that are more specific than "the device is not settled"."""
 
 
 def code_of(e: BaseException) -> Code | None:
-    """The code of an error: of the first cause that has one of its own. None of
-    bad input."""
+    """Code of an error: that of its first cause with a code of its own. None for bad
+    input."""
     if ran_out_of_memory(e):
         return Code.MEMORY
     causes = [e]
@@ -118,4 +119,4 @@ _CODES: tuple[tuple[type[BaseException], Code], ...] = (
     (DeviceSilent, Code.LOST),
     (BusError, Code.LOST),
 )
-"""In the order in which they are looked for."""
+"""Error classes with their codes, in the order of the search."""

@@ -16,7 +16,7 @@ from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
-from triaxcald.abort import Left, at_abort
+from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.documents import to_text
 from triaxcald.errors import BAD_INPUT, Implausible, InputError, RecordingError
 from triaxcald.files import write_new
@@ -32,21 +32,28 @@ from triaxcald.outcome import (
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.journal import journaled_image, open_journal, parse, registers_of
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.registers import Doubt, RegisterImage, Snapshot, image_of, leaves_open, require_readings_before
+from triaxcald.provision.registers import (
+    RegisterImage,
+    SanityWarning,
+    Snapshot,
+    image_of,
+    leaves_open,
+    require_readings_before,
+)
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 from triaxcald.software import software
 from triaxcald.station.config import Place, Station
-from triaxcald.station.output_check import doubts_of_live_output
+from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
 
 
 @dataclass(frozen=True)
 class Provisioned:
-    """``error`` is one line where it failed; ``path`` is where the outcome was
-    written, if it was."""
+    """Result of a provisioning: ``error`` is one line if it failed, ``path`` that of
+    the written outcome, if any."""
 
     exit_code: int
     document: tc.interchange.Document
@@ -57,9 +64,9 @@ class Provisioned:
 
 @dataclass
 class ProvisionRun:
-    """Writes ``image``, meant for the unit ``serial``, to the device at
-    ``place``; without an image, the one of a provisioning that was cut short.
-    ``force`` is the reason to write in spite of doubts."""
+    """Writes ``image``, meant for the unit ``serial``, to the device at ``place``;
+    without an image, that of an interrupted provisioning. ``force`` is the reason to
+    write in spite of sanity warnings."""
 
     station: Station
     place: Place
@@ -68,26 +75,26 @@ class ProvisionRun:
     dry_run: bool = False
     force: str | None = None
     ask: Callable[[str], None] | None = None
-    """Shows the operator what to do; given, the supply is to be switched off
-    and on where nothing else shows what is stored."""
+    """Instructs the operator. If given, it asks for a power cycle when no restart
+    proves the stored values."""
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
-    doubts: Sequence[Doubt] = field(default=(), init=False)
+    warnings: Sequence[SanityWarning] = field(default=(), init=False)
     _begun: Provisioning | None = field(default=None, init=False)
 
     async def run(self) -> Provisioned:
-        """Raises nothing, not even when it is cancelled: it says everything in
-        the outcome."""
+        """Provision. Raises nothing, not even when cancelled: the outcome has every
+        error."""
         ending: Ending | None = None
         try:
-            with at_abort(self.left):
+            with at_abort(self.abort_notice):
                 async with self.place.opened() as device:
                     await self._work(device)
                     ending = Ending.of(Code.NOT_CHECKED, self._done())
                     if self.dry_run:
                         ending = replace(ending, code=None)
-        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the outcome is owed whatever happens
-            if ending is None:  # what only the closing was stopped in is done
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - every ending has an outcome
+            if ending is None:  # an error of the closing alone changes nothing
                 ending = aborted(e, self.provisioning)
         assert ending is not None
         document = self._document(ending)
@@ -101,27 +108,31 @@ class ProvisionRun:
                 document = self._document(ending)
         return Provisioned(ending.exit_code, document, self.provisioning, self._error(ending), path)
 
-    def left(self, _: float) -> Left | None:
-        """What the end at once would leave behind."""
+    def abort_notice(self, _: float) -> AbortNotice | None:
+        """State of the device after an abort at this moment."""
         p = self._begun
-        return Left(text.left(p, self.station.path), not p.settled) if p is not None and p.examined else None
+        return (
+            AbortNotice(text.abort_notice(p, self.station.path), not p.settled)
+            if p is not None and p.examined
+            else None
+        )
 
     async def _work(self, device: Device) -> None:
         bundle = self.place.bundle
         link = RegisterLink(device, bundle.profile, name=self.place.device_name)
         image = self.image or await self._image_of_journal(link)
         p = self._begin(link, image)
-        if self.image is not None and leaves_open(bundle.profile):  # a resume finishes what was begun
+        if self.image is not None and leaves_open(bundle.profile):  # a resume completes an earlier decision
             await p.look()
             self.provisioning = p
             require_readings_before(bundle.profile, p.found)
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
-        self.doubts = p.doubts
-        if not p.carried and p.differing and not self.doubts:
-            self.doubts = await doubts_of_live_output(device, bundle, p.found)
-        if self.doubts and self.force is None and not self.dry_run:
-            raise Implausible(text.doubted(self.doubts))
+        self.warnings = p.warnings
+        if not p.carried and p.differing and not self.warnings:
+            self.warnings = await live_output_warnings(device, bundle, p.found)
+        if self.warnings and self.force is None and not self.dry_run:
+            raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         if not self.dry_run:
             with p.finishing():
                 await p.write()
@@ -160,8 +171,7 @@ class ProvisionRun:
 
     @property
     def _open_journal(self) -> Path | None:
-        """The journal of an earlier provisioning, or of this one, where it is
-        still needed."""
+        """The journal of this or an earlier provisioning, if it is still needed."""
         if self._begun is not None and self._begun.identified:
             return self._begun.open_journal
         serial = self.serial or self.place.unit.serial
@@ -189,7 +199,7 @@ class ProvisionRun:
             software=software(),
             supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
             journal=str(self._open_journal) if self._open_journal else None,
-            forced=self.force if self.doubts else None,
+            forced=self.force if self.warnings else None,
         )
 
     def _write(self, document: tc.interchange.Document) -> Path:
@@ -204,7 +214,7 @@ class ProvisionRun:
         told = [ending.reason]
         p = self._begun
         if p is not None and (p.examined or p.open_journal):
-            told.append(text.left(p, self.station.path))
+            told.append(text.abort_notice(p, self.station.path))
         elif self._open_journal:
             told.append(text.unfinished(self._open_journal, self.place.unit.name, self.station.path))
         return "; ".join(filter(None, told))
@@ -212,8 +222,8 @@ class ProvisionRun:
 
 @dataclass
 class RestoreRun(ProvisionRun):
-    """Puts ``snapshot`` back into the device at ``place``. ``source`` is the
-    recording or the journal that kept it."""
+    """Restores ``snapshot`` in the device at ``place``. ``source`` is the recording
+    or the journal that contains it."""
 
     snapshot: Snapshot = field(default_factory=lambda: Snapshot({}))
     source: Path | None = None
@@ -237,8 +247,8 @@ class RestoreRun(ProvisionRun):
 
 
 def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
-    """The registers that a recording or a journal has kept, and the name of the
-    unit. Raises InputError."""
+    """The register snapshot of a recording or a journal, and the name of the unit.
+    Raises InputError."""
     held, serial, unit = _kept(path)
     for name, raw in held.items():
         if name not in profile.registers:
@@ -251,7 +261,7 @@ def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
 
 
 def unit_in(path: Path) -> str | None:
-    """The name of the unit whose registers they are. Raises InputError."""
+    """The name of the unit in a recording or a journal. Raises InputError."""
     return _kept(path)[2]
 
 

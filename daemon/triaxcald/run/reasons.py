@@ -1,4 +1,4 @@
-"""Why work ended before its time: in one line, and where in this program."""
+"""Reasons of work that ended early: one line for people, a traceback for developers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from triaxcald.memory import out_of_memory, ran_out_of_memory
 
 
 def reason_of(e: BaseException) -> str:
-    """Of an end before its time, in one line."""
+    """Reason of an early end, in one line."""
     if isinstance(e, asyncio.CancelledError):
         return "interrupted"
     if is_internal(e) and ran_out_of_memory(e):
@@ -21,11 +21,11 @@ def reason_of(e: BaseException) -> str:
 
 
 def trace_of(e: BaseException) -> str | None:
-    """Where an internal error came from, for who mends it; None of any other."""
+    """Traceback of an internal error; None of any other error."""
     internal = is_internal(e) and not ran_out_of_memory(e)
     return "".join(traceback.format_exception(e)) if internal else None
 
 
 def is_internal(e: BaseException) -> bool:
-    """Whether nobody raises such an error on purpose."""
+    """Whether the error is none of the packages' own: a defect of this program."""
     return not isinstance(e, (tc.TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))

@@ -30,22 +30,24 @@ from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.software import versions
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress, Recorded
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station
-from triaxcald.station.listening import Listened, RawRecords, ReturningBus
+from triaxcald.station.listening import Listened, RawRecords, ReconnectingBus
 from triaxcald.station.lock import locked
+from triaxcald.station.reconnect import RetryPolicy
 from triaxcald.text import NOTHING_YET
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What the recording of a unit, or of a bus, has come to. ``counts`` are of
-    the unit's readings, which span ``seconds`` of the unit's own time and
-    ``host_seconds`` of the host's, or of the bus's frames; in ``gaps`` gaps it
-    was lost for ``gaps_s``, and ``lost`` raw records did not get to the disk.
-    ``unconfirmed`` raw records came after the unit was last confirmed to be
-    there, and are in no count but that. ``error`` is one line where it failed,
-    and ``trace`` says where in this program, where the fault is its own."""
+    """Result of the recording of a unit or a bus.
+
+    ``counts`` are those of the unit's readings or of the bus's frames. They span
+    ``seconds`` of the unit's own time and ``host_seconds`` of the host's. ``gaps``
+    interruptions took ``gaps_s``; ``lost`` raw records did not reach the disk.
+    ``unconfirmed`` raw records came after the last confirmation of the unit, and are
+    in no other count. ``error`` is one line if the recording failed, ``trace`` the
+    traceback of an internal error.
+    """
 
     unit: str
     path: Path | None
@@ -68,10 +70,9 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class UnitStatus:
-    """How the recording of a unit, or of a bus, stands. ``trouble`` is what is
-    the matter with one that is waited for; ``last_ns`` host time of the last
-    record, ``latest`` the last values of its other channels; ``queued`` batches
-    wait for the disk; the rest as in `Kept`."""
+    """Status of the recording of a unit or a bus. ``trouble`` is the reason of a
+    wait, ``last_ns`` the host time of the last record, ``latest`` the last values of
+    the other channels; ``queued`` batches wait for the disk; the rest as in `Kept`."""
 
     unit: str
     state: State
@@ -89,9 +90,8 @@ class UnitStatus:
 
 
 class AtRecording(ABC):
-    """One of the recordings that a process makes side by side, of a unit or a
-    bus of that ``name``, whose records go through ``records``. ``progress``
-    shows the operator how it goes."""
+    """One of the parallel recordings of a process, of the unit or bus ``name``. Its
+    records pass through ``records``; ``progress`` informs the operator."""
 
     kind: Kind
 
@@ -99,21 +99,21 @@ class AtRecording(ABC):
         self.name, self._records, self._progress = name, records, progress
         self._path: Path | None = None
         self._written: Path | None = None
-        """The last file of it."""
+        """The last file of the recording."""
         self._writer: RecordingWriter | None = None
         self._lost = 0
         self._state = State.WAITING
         self._trouble: str | None = None
         self._leaves = self._was_behind = False
         self._wrong: WrongUnit | None = None
-        """By which another unit was noticed, which weighs more than a stop."""
+        """The error of a noticed exchange of the unit, more important than a stop."""
         self._unconfirmed = 0
         self._kept_for: str | None = None
 
     @property
     def status(self) -> UnitStatus:
-        """From any thread. One that loses what comes, as the disk does not keep
-        up, is waited for."""
+        """Status, from any thread. A recording that loses records because the disk is
+        too slow counts as waiting."""
         records, writer = self._records, self._writer
         state, trouble = self._state, self._trouble
         if state is State.RECORDING and writer is not None and writer.is_behind:
@@ -154,11 +154,11 @@ class AtRecording(ABC):
         return {}
 
     @abstractmethod
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
-        """As `run`, but for what it raises."""
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
+        """The work of `run`, which may raise."""
 
     def _result(self) -> Kept:
-        """What it has come to so far."""
+        """The result so far."""
         records = self._records
         return Kept(
             self.name, self._path, self._counts, self._seconds, records.gaps, records.gaps_s, self._lost,
@@ -166,15 +166,14 @@ class AtRecording(ABC):
         )  # fmt: skip
 
     def leave(self) -> None:
-        """Nobody wants it any more: a cancellation from now on ends it as one
-        that has been asked to end."""
+        """Treat a later cancellation as a requested end."""
         self._leaves = True
 
-    async def run(self, seconds: float | None, patience: Patience) -> Kept:
-        """Until there are so many ``seconds``, for ever where None, or until it
-        is given up. Raises nothing, not even when it is cancelled."""
+    async def run(self, seconds: float | None, policy: RetryPolicy) -> Kept:
+        """Record for ``seconds`` (None: without end), or until the policy gives up.
+        Raises nothing, not even when cancelled."""
         try:
-            await self._work(seconds, patience)
+            await self._work(seconds, policy)
         except (Exception, asyncio.CancelledError) as raised:  # noqa: BLE001 - the one place that supervises a recording
             e = self._cause(raised)
             if self._asked(e):
@@ -185,7 +184,7 @@ class AtRecording(ABC):
         else:
             if self._trouble is None:
                 return self._result()
-            # One stream brought all that was asked for, another is not back.
+            # One stream is complete, but another one is still lost.
             return replace(self._result(), exit_code=DEVICE, error=f"{self.kind} {self.name}: {self._trouble}")
         finally:
             self._state = State.ENDED
@@ -196,9 +195,9 @@ class AtRecording(ABC):
         record: Callable[[RecordingWriter], Awaitable[None]],
         manifest: Path | None,
     ) -> None:
-        """Has a writer made and ``record`` work with it; the file is whole in
-        the end, and says why it ended. A ``manifest`` is this process's alone
-        meanwhile. Raises DeviceInUse where it is another's."""
+        """Make a writer and let ``record`` work with it. The finished file is complete
+        and states why it ended. This process claims the ``manifest`` meanwhile.
+        Raises DeviceInUse if another process has it."""
         async with AsyncExitStack() as claimed:
             if manifest is not None:
                 await claimed.enter_async_context(locked(Claim(f"recording {manifest.resolve()}")))
@@ -207,14 +206,14 @@ class AtRecording(ABC):
     async def _written_by(
         self, make: Callable[[], RecordingWriter], record: Callable[[RecordingWriter], Awaitable[None]]
     ) -> None:
-        """To find the end of a segment that was cut off, and to write an end,
-        may take a while."""
+        """Open and close the writer on a thread: finding the end of an interrupted
+        segment and writing an end may take long."""
         with await whole_on_a_thread(make) as writer:
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             if writer.warning is not None:
                 self._progress.stage(self.name, f"warning: {writer.warning}")
             try:
-                # A disk fails while a unit is lost, and nothing comes, too.
+                # A disk may also fail while a unit is lost and sends nothing.
                 await while_sound(record(writer), partial(self._look_after, writer), LOOK_S)
             except (Exception, asyncio.CancelledError) as e:
                 await self._end(writer, self._cause(e))
@@ -237,7 +236,8 @@ class AtRecording(ABC):
         self._was_behind, self._kept_for = is_behind, document
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
-        """Where the disk has failed, that is on its way already."""
+        """Close the file with its reason. A failure of the disk is being raised
+        already."""
         with suppress(RecordingError):
             if not isinstance(e, asyncio.CancelledError):
                 writer.event("failed", {"error": reason_of(e)})
@@ -245,39 +245,40 @@ class AtRecording(ABC):
             await whole_on_a_thread(partial(writer.close, because))
 
     def _cause(self, e: BaseException) -> BaseException:
-        """A stop is not why it ended where another unit was noticed then."""
+        """The cause of an end: a noticed exchange of the unit has priority over a
+        stop."""
         return self._wrong if self._wrong is not None and isinstance(e, asyncio.CancelledError) else e
 
     def _asked(self, e: BaseException) -> bool:
         return self._leaves and isinstance(e, asyncio.CancelledError)
 
 
-# Which recordings a process makes side by side; that may change meanwhile.
+# The parallel recordings of a process, which may change while it runs.
 
 
 class Roster:
-    """Each records for so many ``seconds``, for ever where None, or until it is
-    given up; one that ends does not stop the others, and ``ended`` is told of
-    it."""
+    """The running recordings. Each records for ``seconds`` (None: without end), or
+    until the policy gives up. One that ends does not stop the others; ``ended``
+    receives its result."""
 
     def __init__(
-        self, seconds: float | None, patience: Patience, ended: Callable[[Kept], None] = lambda _: None
+        self, seconds: float | None, policy: RetryPolicy, ended: Callable[[Kept], None] = lambda _: None
     ) -> None:
-        self._seconds, self._patience, self._ended = seconds, patience, ended
+        self._seconds, self._policy, self._ended = seconds, policy, ended
         self._work: dict[str, tuple[AtRecording, asyncio.Task[Kept]]] = {}
         self._changes = 0
         self._changed = asyncio.Event()
         self._stopped = False
 
     def statuses(self) -> list[UnitStatus]:
-        """Of the last recording of each name that is on it. From any thread."""
+        """Status of the last recording of each name. From any thread."""
         return [one.status for one, _ in tuple(self._work.values())]
 
     def at_work(self) -> set[str]:
         return {name for name, (_, task) in self._work.items() if not task.done()}
 
     def ended_with(self, code: int) -> set[str]:
-        """Those whose last recording ended with that exit code."""
+        """Names whose last recording ended with that exit code."""
         return {
             name
             for name, (_, task) in self._work.items()
@@ -285,7 +286,8 @@ class Roster:
         }
 
     def begin(self, recordings: Iterable[AtRecording]) -> None:
-        """None of a name that is at work; nothing, once all are to end."""
+        """Begin recordings, none with the name of a running one; begins nothing once
+        all are stopped."""
         if self._stopped:
             return
         for one in recordings:
@@ -293,8 +295,8 @@ class Roster:
         self._changed.set()
 
     async def change(self, leaving: Collection[str], beginning: Iterable[AtRecording]) -> None:
-        """Those of the names ``leaving`` end as if asked to, and are on it no
-        more; then the others begin, unless all are to end by then."""
+        """End and remove the recordings ``leaving``, then begin the others, unless all
+        are stopped by then."""
         self._changes += 1
         try:
             going = [self._work[name] for name in leaving if name in self._work]
@@ -312,13 +314,13 @@ class Roster:
             self._changed.set()
 
     async def finish(self) -> list[Kept]:
-        """What those on it have come to, once none is at work. When this is
-        cancelled every one of them is, again each time, and waited for; what
-        was recorded is whole."""
+        """Results of all recordings, once none is running. Each cancellation is passed
+        on to every recording, and their ends are awaited, so every file is
+        complete."""
         while True:
             pending = [task for _, task in self._work.values() if not task.done()]
             if not pending and not self._changes:
-                # One that was cancelled before its first step has come to nothing.
+                # A recording that was cancelled before its first step has no result.
                 return [task.result() for _, task in self._work.values() if not task.cancelled()]
             self._changed.clear()
             changed = asyncio.ensure_future(self._changed.wait())
@@ -332,18 +334,18 @@ class Roster:
                 changed.cancel()
 
     async def _record(self, one: AtRecording) -> Kept:
-        kept = await one.run(self._seconds, self._patience)
+        kept = await one.run(self._seconds, self._policy)
         self._ended(kept)
         return kept
 
 
-# A bus that is recorded: all its frames, for later, of no unit.
+# Recording of a bus: all its frames, assigned to no unit.
 
 
 class BusRecording(AtRecording):
-    """The recording of one bus, at what ``path_of`` gives once it is open, in
-    ``segments`` where they are given. ``progress`` shows the operator how it
-    goes, ``clock_ns`` is the host's time since the epoch."""
+    """Recording of one bus. ``path_of`` gives the path once the bus is open;
+    ``segments`` splits the recording. ``progress`` informs the operator, ``clock_ns``
+    is the host's time since the epoch."""
 
     kind = "bus"
 
@@ -371,28 +373,28 @@ class BusRecording(AtRecording):
     def _seconds(self) -> float:
         return self._listened.seconds
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
-        is_lost = partial(self._is_lost, patience)
-        async with self._place.opened(patience, lambda trouble: is_lost(str(trouble))) as listener:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
+        is_lost = partial(self._is_lost, policy)
+        async with self._place.opened(policy, lambda trouble: is_lost(str(trouble))) as listener:
             self._path = self._path_of()
 
             async def record(writer: RecordingWriter) -> None:
                 self._progress.stage(self.name, "recording")
-                await self._listened.for_seconds(ReturningBus(listener, patience, is_lost), writer, seconds)
+                await self._listened.for_seconds(ReconnectingBus(listener, policy, is_lost), writer, seconds)
 
             make = partial(self._new_writer, self._path)
             await self._recorded_by(make, record, self._path if self._segments else None)
 
-    def _is_lost(self, patience: Patience, trouble: str | None) -> None:
+    def _is_lost(self, policy: RetryPolicy, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
         self._trouble = trouble
         if trouble is None:
             self._progress.stage(self.name, text.BUS_IS_BACK)
         else:
-            self._progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
+            self._progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
 
     def _new_writer(self, path: Path) -> RecordingWriter:
-        """With the station file in it. Raises RecordingError."""
+        """A writer with the station file as attachment. Raises RecordingError."""
         bus = self._place.settings
         told = {"name": self._place.name, "bitrate": "" if bus.bitrate is None else str(bus.bitrate)}
         settings: dict[str, Any] = {
@@ -413,12 +415,12 @@ def bus_recording_name(bus: str, time_ns: int) -> str:
     return f"{bus}-{stamp(time_ns)}.mcap"
 
 
-# A unit that is recorded.
+# Recording of a unit.
 
 
 class UnitRecording(AtRecording):
-    """One unit's recording, at ``path_of`` its identity, in ``segments`` where
-    they are given; ``identified`` is told who it is, once it is there."""
+    """Recording of one unit. ``path_of`` gives the path from its identity,
+    ``segments`` splits the recording; ``identified`` receives the identity."""
 
     kind = "unit"
 
@@ -435,8 +437,8 @@ class UnitRecording(AtRecording):
 
     @property
     def status(self) -> UnitStatus:
-        """Recorded is a unit of which samples come: what its FIFO held before is
-        discarded meanwhile, which may take a minute."""
+        """Status; a unit counts as waiting until samples come. Discarding the old
+        contents of its FIFO may take a minute."""
         status = super().status
         if status.state is State.RECORDING and not status.counts["samples"]:
             return replace(status, state=State.WAITING, trouble=NOTHING_YET)
@@ -458,9 +460,9 @@ class UnitRecording(AtRecording):
     def _latest(self) -> dict[str, float]:
         return dict(self._recorded.latest)
 
-    def _waits(self, patience: Patience, trouble: Exception) -> None:
+    def _waits(self, policy: RetryPolicy, trouble: Exception) -> None:
         self._is_lost(str(trouble))
-        self._session.waits(patience, trouble)
+        self._session.waits(policy, trouble)
 
     def _is_lost(self, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING
@@ -470,13 +472,13 @@ class UnitRecording(AtRecording):
         super().leave()
         self._session.leave()
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         session, found = self._session, list[IdentityRead]()
 
         async def identify(device: Device) -> None:
             found[:] = [await session.identify(device)]
 
-        async with session.place.opened(patience, partial(self._waits, patience), identify) as device:
+        async with session.place.opened(policy, partial(self._waits, policy), identify) as device:
             (identity,) = found
             self._identified(session, identity)
             self._path = self._path_of(identity)
@@ -484,10 +486,10 @@ class UnitRecording(AtRecording):
             async def record(writer: RecordingWriter) -> None:
                 session.progress.stage(session.name, "recording")
                 confirmation = session.confirmation(device, identity, writer, self._recorded)
-                returning = session.returning(device, identity, patience, self._is_lost, confirmation)
+                reconnecting = session.reconnecting(device, identity, policy, self._is_lost, confirmation)
                 try:
                     async with confirmation.phase():
-                        await self._recorded.for_seconds(returning, writer, seconds)
+                        await self._recorded.for_seconds(reconnecting, writer, seconds)
                 finally:
                     self._wrong, self._unconfirmed = confirmation.wrong, confirmation.unconfirmed
 

@@ -21,9 +21,9 @@ from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_chann
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded
-from triaxcald.station.coming_back import HOLE_S, Patience, Returning, Streaming
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
+from triaxcald.station.reconnect import HOLE_S, ReconnectingDevice, RetryPolicy, Streaming
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Segments:
 
 
 def new_writer(path: Path, segments: Segments | None, **settings: Any) -> RecordingWriter:
-    """With ``settings`` of a `RecordingWriter`, in segments where they are
-    given. Raises RecordingError."""
+    """A writer with the ``settings`` of a `RecordingWriter`, in ``segments`` if given.
+    Raises RecordingError."""
     if segments is None:
         return RecordingWriter(path, **settings)
     from triaxcald.recording.segments import SegmentedWriter  # which reads recordings too
@@ -52,8 +52,9 @@ def stamp(time_ns: int) -> str:
 
 
 class UnitSession:
-    """``progress`` shows the operator how it goes, ``serials`` refuses a unit
-    that is there twice, ``clock_ns`` is the host's time since the epoch."""
+    """Work with one unit of a station. ``progress`` informs the operator, ``serials``
+    refuses a serial number that occurs twice, ``clock_ns`` is the host's time since
+    the epoch."""
 
     def __init__(
         self,
@@ -70,24 +71,24 @@ class UnitSession:
         self.profile = place.bundle.profile
 
     def leave(self) -> None:
-        """Its serial number may be that of another unit of the station."""
+        """Release the serial number, which another place of the station may get."""
         self.serials.discard(self.name)
 
-    def waits(self, patience: Patience, trouble: Exception) -> None:
-        """The unit is not there, for now."""
-        self.progress.lost(self.name, text.waited_for(str(trouble), endless=patience.endless))
+    def waits(self, policy: RetryPolicy, trouble: Exception) -> None:
+        """Report that the unit is lost and retried."""
+        self.progress.lost(self.name, text.waited_for(str(trouble), endless=policy.endless))
 
-    def returning(
+    def reconnecting(
         self,
         device: Device,
         identity: IdentityRead,
-        patience: Patience,
+        policy: RetryPolicy,
         lost: Callable[[str | None], None] = lambda _: None,
         confirmation: Confirmation | None = None,
     ) -> Streaming:
-        """The device, waited for where it is lost; it is this unit that has to
-        come back, and, by ``confirmation``, that has to stay. ``lost`` is told
-        what is the matter, and None when it is over."""
+        """The device with reconnection. The same unit has to answer after it and, by
+        ``confirmation``, has to stay. ``lost`` receives the reason of an interruption,
+        and None when it is over."""
 
         async def identify() -> None:
             same = partial(self._require_same, device, identity)
@@ -98,18 +99,18 @@ class UnitSession:
             if trouble is None:
                 self.progress.stage(self.name, text.IS_BACK)
             else:
-                self.progress.lost(self.name, text.waited_for(trouble, endless=patience.endless))
+                self.progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
 
-        # A unit of which a sample is rare is not silent before its profile says so.
+        # A unit with rare samples is silent only after the time of its profile.
         hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)
-        returning = Returning(device, identify, patience, tell, hole_s=hole_s)
-        return returning if confirmation is None else confirmation.of(returning)
+        reconnecting = ReconnectingDevice(device, identify, policy, tell, hole_s=hole_s)
+        return reconnecting if confirmation is None else confirmation.of(reconnecting)
 
     def confirmation(
         self, device: Device, identity: IdentityRead, writer: RecordingWriter | None, recorded: Recorded
     ) -> Confirmation:
-        """Of a unit that has just been identified, and of which ``recorded`` is
-        about to take records."""
+        """Confirmation of a unit that was just identified, before ``recorded`` takes
+        its records."""
         told = self.profile.identity
         asked = partial(self._require_same, device, identity) if told.serial_register or told.expect else None
         return Confirmation(asked, writer, recorded, lambda why: self.progress.stage(self.name, text.unidentified(why)))
@@ -118,7 +119,7 @@ class UnitSession:
         """Raises WrongUnit, TwoAnswer."""
         expected, bundle = identity.serial or self.place.unit.serial, self.place.bundle
         link = RegisterLink(device, self.profile, name=self.place.device_name)
-        # Once, without the patience of the link: who waits for a unit asks again.
+        # One request without the link's retries: the reconnection retries itself.
         await identified(link, bundle, expected, where=self.place.address, device=device)
 
     async def identify(self, device: Device) -> IdentityRead:
@@ -153,8 +154,8 @@ class UnitSession:
         segments: Segments | None = None,
         more: Mapping[str, Mapping[str, str]] | None = None,
     ) -> RecordingWriter:
-        """With station file and profile in it, and ``more`` metadata. Raises
-        RecordingError."""
+        """A writer with station file and profile attached, and ``more`` metadata.
+        Raises RecordingError."""
         unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
         settings: dict[str, Any] = {
             "metadata": {

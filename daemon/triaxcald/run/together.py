@@ -1,5 +1,4 @@
-"""Units at work side by side, each of which comes to its own end and holds no
-other up."""
+"""Runs units side by side: each ends by itself and delays no other."""
 
 from __future__ import annotations
 
@@ -14,8 +13,8 @@ T = TypeVar("T")
 
 
 async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
-    """What each gives, in their order. When this is cancelled every one of them
-    is, again each time, and waited for."""
+    """Results of all, in order. Each cancellation is passed on to every one, and
+    their ends are awaited."""
     units = [asyncio.ensure_future(one) for one in work]
     while not all(unit.done() for unit in units):
         try:
@@ -27,8 +26,8 @@ async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
 
 
 async def while_sound(work: Awaitable[None], check: Callable[[], None], every_s: float) -> None:
-    """Until the work ends, or ``check`` raises, which looks every so many
-    seconds; the work is cancelled then, and waited for."""
+    """Await the work, and call ``check`` every ``every_s`` seconds. If ``check``
+    raises, the work is cancelled and its end awaited."""
     task = asyncio.ensure_future(work)
     try:
         while not (await asyncio.wait([task], timeout=every_s))[0]:
@@ -39,22 +38,24 @@ async def while_sound(work: Awaitable[None], check: Callable[[], None], every_s:
             with suppress(asyncio.CancelledError):
                 await asyncio.wait([task])
         if not task.cancelled():
-            task.exception()  # what is on its way already weighs more
+            task.exception()  # retrieved and dropped: the current error has priority
         raise
     await task
 
 
 async def whole_on_a_thread(work: Callable[[], T]) -> T:
-    """What ``work`` gives, which is waited for in any case, on a thread of its
-    own: those that the loop has may all be busy with devices that hang. A
-    cancellation meanwhile strikes at the next await, unless ``work`` raises."""
+    """Result of ``work`` on a thread of its own, awaited in any case.
+
+    The loop's own threads may all be busy with devices that hang. A cancellation
+    takes effect at the next await afterwards, unless ``work`` raises.
+    """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()
 
     def run() -> None:
         try:
             given = work()
-        except BaseException as e:  # noqa: BLE001 - whatever it is, it is raised where it is waited for
+        except BaseException as e:  # noqa: BLE001 - every error is raised in the awaiting task
             soon(loop, partial(done.set_exception, e))
         else:
             soon(loop, partial(done.set_result, given))
@@ -73,6 +74,6 @@ async def whole_on_a_thread(work: Callable[[], T]) -> T:
 
 
 def soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
-    """In the loop, from any thread or a signal's handler."""
-    with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
+    """Call ``act`` in the loop, from any thread or a signal handler."""
+    with suppress(RuntimeError):  # the loop has ended, so nobody waits
         loop.call_soon_threadsafe(act)

@@ -23,10 +23,10 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import (
     LEAST,
-    Doubt,
     RegisterImage,
+    SanityWarning,
     departure_g,
-    doubt_of_departure,
+    departure_warnings,
     is_blank,
     require_readings_before,
 )
@@ -49,18 +49,20 @@ from triaxcald.verification import (
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 FIRST_POSES = 4
-"""Of so many poses at the start of either stream at least one is in the other
-stream too."""
+"""Poses at the start of either stream of which at least one is in the other stream
+too."""
 REGISTERS_EARLIER = "registers-earlier.json"
-"""What the device held before an earlier provisioning that was cut short: what
-an undoing brings back."""
+"""Registers before an earlier, interrupted provisioning, which an undo restores."""
 
 
 @dataclass
 class WriteBack:
-    """``collect`` fetches check poses, ``ask`` shows the operator what to do;
-    ``force`` is the reason to go on in spite of `doubts`. ``verdict`` is the
-    one on the device's own output, None before it is judged."""
+    """Writes a calibration into the device and verifies it.
+
+    ``collect`` collects check poses, ``ask`` instructs the operator; ``force`` is
+    the reason to continue in spite of `warnings`. ``verdict`` is that on the
+    device's own output, None before it is judged.
+    """
 
     place: Place
     station: Station
@@ -71,11 +73,11 @@ class WriteBack:
     force: str | None = None
     verification: tc.interchange.Document | None = field(default=None, init=False)
     verdict: str | None = field(default=None, init=False)
-    doubts: Sequence[Doubt] = field(default=(), init=False)
+    warnings: Sequence[SanityWarning] = field(default=(), init=False)
     provisioning: Provisioning | None = field(default=None, init=False)
 
     async def examine(
-        self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection
+        self, device: Device, image: RegisterImage, serial: str | None, acquisition: Collection
     ) -> Provisioning:
         """Identifies the unit and reads its registers; nothing is written.
         Raises Implausible, Refused, ProvisionError, StationError, DiskError."""
@@ -95,28 +97,28 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
-        self.doubts = [*p.doubts, *self._doubts_of_output(tumble)]
-        if self.doubts and self.force is None:
-            raise Implausible(text.doubted(self.doubts))
+        self.warnings = [*p.warnings, *self._output_warnings(acquisition)]
+        if self.warnings and self.force is None:
+            raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         self._attach(REGISTERS_BEFORE, p.found.raw)
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
         return p
 
-    async def write(self, p: Provisioning, tumble: Collection) -> None:
-        """Whatever is raised on the way, the old calibration has been put back
-        before, or `held` says what is not. Raises ProvisionError, StationError,
+    async def write(self, p: Provisioning, acquisition: Collection) -> None:
+        """Write and verify. Before any error is raised the old calibration is restored,
+        or `held` has the state of the device. Raises ProvisionError, StationError,
         DiskError."""
         with p.finishing():
             await p.write()
-            await self._finish(p, tumble)
+            await self._finish(p, acquisition)
 
-    async def _finish(self, p: Provisioning, tumble: Collection) -> None:
+    async def _finish(self, p: Provisioning, acquisition: Collection) -> None:
         try:
             self._attach(REGISTERS_AFTER, p.after.raw)
             self.writer.event("provisioned", {"written": list(p.written)})
-            self.verdict = await self._verify(tumble)
-        except (DiskError, WrongUnit, TwoAnswer):  # said as they are
+            self.verdict = await self._verify(acquisition)
+        except (DiskError, WrongUnit, TwoAnswer):  # raised unchanged
             await p.undo()
             raise
         except (DriverError, DaemonError, tc.TriaxcalError) as e:
@@ -133,29 +135,29 @@ class WriteBack:
             if (task := asyncio.current_task()) and task.cancelling():
                 raise asyncio.CancelledError
 
-    def _doubts_of_output(self, tumble: Collection) -> list[Doubt]:
+    def _output_warnings(self, acquisition: Collection) -> list[SanityWarning]:
         assert self.provisioning is not None
-        if CORRECTED not in tumble.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
+        if CORRECTED not in acquisition.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
             return []
         profile, found = self.place.bundle.profile, self.provisioning.found
-        readings, outputs = tumble.pipelines[READINGS].poses(), tumble.pipelines[CORRECTED].poses()
+        readings, outputs = acquisition.pipelines[READINGS].poses(), acquisition.pipelines[CORRECTED].poses()
         departures = [
             off_g
             for pairs in _alignments(readings, outputs)
             if (off_g := departure_g(profile, found, *_paired(pairs))) is not None
         ]
-        return doubt_of_departure(min(departures, default=None))
+        return departure_warnings(min(departures, default=None))
 
-    async def _verify(self, tumble: Collection) -> str:
-        """What the device's own output is judged to be."""
+    async def _verify(self, acquisition: Collection) -> str:
+        """Verify the device's own output in check poses; the verdict."""
         if CORRECTED not in self.place.bundle.profile.streams:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
         found, reference = corrected(check, self.station.file.reference), self.station.file.reference
-        fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
+        fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
         document = self.verification = verification_document(
-            corrected(tumble, reference),
+            corrected(acquisition, reference),
             found,
             limit_g=self.station.file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),
@@ -174,16 +176,15 @@ class WriteBack:
 
 
 def corrected(collection: Collection, reference: float) -> Verification:
-    """What the device itself reported of a collection's poses."""
+    """The device's own output in the poses of a collection."""
     return verified(collection.pipelines[CORRECTED], reference)
 
 
 def _alignments(readings: Sequence[tc.Pose], outputs: Sequence[tc.Pose]) -> Iterator[list[tuple[tc.Pose, tc.Pose]]]:
-    """Poses of the two streams that lie over each other, for each way to lay
-    one over the other.
+    """Pairs of overlapping poses of the two streams, for each possible time shift.
 
-    Each stream counts its seconds from its own first sample, and either may
-    have begun some poses later.
+    Each stream counts its seconds from its own first sample, and either may begin
+    some poses later.
     """
     (r0, r1), (c0, c1) = (np.array([(p.start_s, p.end_s) for p in s]).reshape(-1, 2).T for s in (readings, outputs))
     apart_s = np.subtract.outer(r0, c0)

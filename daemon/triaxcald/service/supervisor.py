@@ -1,5 +1,5 @@
-"""What a service owes to systemd: that it is up, that it lives, that it
-stops (sd_notify(3))."""
+"""Reports to systemd (sd_notify(3)) that the service is ready, alive or stopping, and
+serves its metrics."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 
 _SHARE = 3.0
-"""Of the watchdog's time a sign of life comes so many times: one that is late
-is followed by another."""
+"""Signs of life per watchdog time, so that one may be late."""
 _QUIET_S = 10.0
-"""Without a watchdog the status is told so often."""
+"""Period of the status reports without a watchdog."""
 
 
 class Supervisor:
-    """Who started this process, where it wants to hear of it; else nobody."""
+    """The supervisor that started this process, if it wants reports."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
@@ -92,11 +91,12 @@ _COUNTED = {
     "malformed": "Records too short for their message, or not as it is defined",
 }
 _OF_A_BUS = ("errors",)
-"""What of them is counted where all frames of a bus are recorded."""
+"""Counts of the recording of a bus."""
 
 
 class UnitMetrics(Collector):
-    """``folder`` is where recordings go: its file system's free space is told."""
+    """Metrics of the recordings; the free space is that of the file system of
+    ``folder``."""
 
     def __init__(self, statuses: Statuses, folder: Path) -> None:
         self._statuses, self._folder = statuses, folder
@@ -176,8 +176,8 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Of a client that has gone meanwhile nothing is said: standard error is
-        the recording's."""
+        """Drop the error of a client that has disconnected: standard error belongs to
+        the recording."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -219,7 +219,7 @@ def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
                 self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Nothing: standard error is the recording's."""
+            """Log nothing: standard error belongs to the recording."""
 
     try:
         server = _Server(("127.0.0.1", port), Page)

@@ -15,7 +15,7 @@ from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.profile import Strict
 from triaxcal_drivers.toml_text import validate
 from triaxcald.errors import InputError
-from triaxcald.station.coming_back import Patience, claimed, until_open
+from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
 
 if TYPE_CHECKING:
     from triaxcal_drivers.can.line import BusListener
@@ -49,23 +49,23 @@ class BusPlace:
         return BusListener(self.settings)
 
     @asynccontextmanager
-    async def opened(self, patience: Patience, tell: Callable[[Exception], None]) -> AsyncIterator[BusListener]:
+    async def opened(self, policy: RetryPolicy, tell: Callable[[Exception], None]) -> AsyncIterator[BusListener]:
         """The bus, listened to until the context ends. Raises DeviceInUse where
-        another process has its serial port, BusError once patience ends
+        another process has its serial port, BusError once the policy gives up
         (``tell`` is told meanwhile)."""
         listener, claim = self.listener(), self.settings.claim_to_listen()
         if claim is None:
-            async with _open(listener, patience, tell):
+            async with _open(listener, policy, tell):
                 yield listener
         else:
-            async with claimed(claim, patience, tell), _open(listener, patience, tell):
+            async with claimed(claim, policy, tell), _open(listener, policy, tell):
                 yield listener
 
 
 @asynccontextmanager
-async def _open(listener: BusListener, patience: Patience, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
+async def _open(listener: BusListener, policy: RetryPolicy, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
     try:
-        await until_open(listener.open, patience, tell)
+        await until_open(listener.open, policy, tell)
         yield
     finally:
         await listener.close()

@@ -11,41 +11,41 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 import triaxcal as tc
-from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcal_drivers.stall_clock import StallTolerantTimer
 from triaxcal_drivers.two_senders import RECORDS
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.errors import NoPoses, RecordingError, TwoAnswer
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
+from triaxcald.station.reconnect import Streaming
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
-"""The poses so far are looked at so often, by the samples' time and by the
-host's, whichever is longer."""
+"""Shortest time between two evaluations of the poses, by the samples' time and by the
+host's; both have to pass."""
 LOOK_SHARE = 5.0
-"""A look is followed by a pause of so many times what it took, or samples would
-be lost meanwhile."""
+"""Pause after an evaluation as a multiple of its duration, so that no samples get
+lost."""
 RESTARTED_S = 3.0
-"""A unit takes longer to restart once more."""
+"""A second restart of a unit takes longer than this."""
 SILENCE_SHARE = 0.25
-"""Of a silence, what one batch without a sample may add. A device that sends
-brings several in that time."""
+"""Share of the time-out that one batch without a sample may add. A sending device
+brings several batches in that time."""
 
 
 DECODE_S = 1.0
-"""Records are decoded together so seldom where nobody is guided by them: what
-it costs to decode a batch hardly depends on how many are in it."""
+"""Time for which records are collected before they are decoded, if no operator is
+guided by them: the cost of a batch hardly depends on its size."""
 
 
 class Progress(Protocol):
-    """Who shows the operator how it goes."""
+    """Display of the progress for the operator."""
 
     def stage(self, unit: str, text: str) -> None: ...
     def lost(self, unit: str, trouble: str) -> None: ...
@@ -54,11 +54,11 @@ class Progress(Protocol):
 
 @dataclass
 class Recorded(RawRecords):
-    """``streams`` are decoded on the way: the readings, and the corrected output
-    where the device has one.
+    """Records of a unit on their way to disk. ``streams`` are decoded meanwhile: the
+    readings, and the corrected output if the device has one.
 
-    ``where`` says where the unit is, for messages; ``latest`` are the last
-    values of the readings' other channels.
+    ``where`` is the place of the unit, for messages; ``latest`` are the last values
+    of the readings' other channels.
     """
 
     phase: Phase
@@ -81,26 +81,26 @@ class Recorded(RawRecords):
     def _decoded(self, stream: str) -> DecodedStream:
         return DecodedStream(self.bundle, stream)
 
-    def mark(self) -> dict[str, Any]:
-        """What the streams have come to so far, for `back_to`."""
+    def checkpoint(self) -> dict[str, Any]:
+        """Checkpoint of all streams, for `roll_back`."""
         self._decode()
-        return {name: stream.mark() for name, stream in self.streams.items()}
+        return {name: stream.checkpoint() for name, stream in self.streams.items()}
 
-    def back_to(self, mark: dict[str, Any]) -> None:
-        """As if nothing had come since. No more records may come."""
+    def roll_back(self, checkpoint: dict[str, Any]) -> None:
+        """Return all streams to a checkpoint. No more records may follow."""
         self._undecoded = []
         for name, stream in self.streams.items():
-            stream.back_to(mark[name])
+            stream.roll_back(checkpoint[name])
 
     async def records(
         self, device: Streaming, writer: RecordingWriter | None, seconds: float | None = None
     ) -> AsyncGenerator[RawBatch]:
-        """What comes off the bus, once it is on its way to disk. It is decoded
-        by then or some batches later, but at once where the readings may have
-        come to so many ``seconds``.
+        """Batches from the bus, after their hand-over to the writer.
 
-        What the disk has no room for goes to neither, so that an audit sees
-        what the station saw. Raises TwoAnswer where two units send.
+        They are decoded at once or some batches later, but at once if the readings may
+        have reached ``seconds``. A batch that the writer drops is not decoded either,
+        so an audit sees the same records as the station. Raises TwoAnswer if two units
+        send.
         """
         stream = cast(Any, device.stream(list(self.streams)))
         async with aclosing(self.written(stream, writer)) as written:
@@ -111,30 +111,30 @@ class Recorded(RawRecords):
                     if self._is_due(batch, seconds):
                         self._decode()
                     yield batch
-            except BaseException:  # which says more than what the rest would
+            except BaseException:  # this error has priority over those of the remaining batches
                 with suppress(RecordingError, TwoAnswer):
                     self._decode()
                 raise
             self._decode()
 
     def _is_due(self, batch: RawBatch, seconds: float | None) -> bool:
-        """Whether what has come is to be decoded by now."""
+        """Whether the collected batches are due for decoding."""
         if self._decoded_ns is None or not len(batch) or batch.gap is not None:
             return True
-        # By the host's clock, which nobody promises to run on: back is due too.
+        # The host's clock may be set back: a negative time is due too.
         since_s = (int(batch.time_ns[-1]) - self._decoded_ns) * 1e-9
         if not 0 <= since_s < self._decode_s:
             return True
         if seconds is None:
             return False
         readings = self.streams[READINGS]
-        if not readings.host_seconds:  # how fast the unit's own time goes is not known yet
+        if not readings.host_seconds:  # the rate of the unit's own time is not known yet
             return True
-        pace = readings.seconds / readings.host_seconds
-        return readings.seconds + max(pace, 1.0) * since_s >= seconds
+        rate = readings.seconds / readings.host_seconds
+        return readings.seconds + max(rate, 1.0) * since_s >= seconds
 
     def _decode(self) -> None:
-        """All that waits for it. Raises TwoAnswer if two units send."""
+        """Decode all collected batches. Raises TwoAnswer if two units send."""
         if not self._undecoded or self._device is None:
             return
         device, writer, mixed = self._device, self._writer, None
@@ -144,20 +144,20 @@ class Recorded(RawRecords):
         for name, decoded in self.streams.items():
             block = decoded.feed(batch)
             mixed = name if block.two_senders else mixed
-            # What it was told when it was opened is gone, and it may be another unit.
+            # A restart loses the settings of the opening, and it may be another unit.
             if block.restarts and self._tells_restart(batch):
                 device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
             if len(block) and name == READINGS:
                 self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
             if writer is not None and len(block):
                 writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
-        if mixed is not None:  # all of the batch is in the file
+        if mixed is not None:  # raised last: the file has the whole batch
             raise TwoAnswer(text.two_senders(self.where, mixed))
 
     def _tells_restart(self, batch: RawBatch) -> bool:
-        """Whether a restart is to be acted upon. Two units that send at once look
-        like restarts without end, and opening the unit each time would keep them
-        from being told: after one, the stream goes on for long enough."""
+        """Whether a restart leads to a reconnection. Two units that send at once look
+        like endless restarts; after one reconnection the stream continues long enough
+        to detect them."""
         after_s = max(RESTARTED_S, 2 * RECORDS / self.bundle.profile.sampling.rate_hz)
         now_ns, before_ns = int(batch.time_ns[-1]), self._restarted_ns
         if before_ns is not None and now_ns - before_ns < after_s * 1e9:
@@ -170,14 +170,14 @@ class Recorded(RawRecords):
 
     @property
     def _timeout_s(self) -> float:
-        """Twice what the driver waits, which knows better what is the matter
-        where nothing comes at all."""
+        """Twice the driver's time-out: the driver has the better error if nothing comes
+        at all."""
         return 2 * self.bundle.profile.sampling.silence_timeout_s
 
     @property
     def _decode_s(self) -> float:
-        """So long records may wait to be decoded together; not so long that a
-        watch looks too seldom."""
+        """Time for which records are collected before decoding, short enough for the
+        watch."""
         return min(DECODE_S, SILENCE_SHARE * self._timeout_s)
 
     async def for_seconds(
@@ -187,8 +187,8 @@ class Recorded(RawRecords):
         seconds: float | None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Records so many seconds of the readings' own time; for ever where
-        None. A device that sends, but no whole reading, hears of it."""
+        """Record ``seconds`` of the readings' own time (None: without end). A device
+        that sends no complete reading is reconnected."""
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer, seconds)) as records:
@@ -203,11 +203,10 @@ class Recorded(RawRecords):
 
 
 class Collection(Recorded):
-    """The same, searched for poses on the way: whoever turns the unit is told
-    at once."""
+    """`Recorded` with a search for poses, which guides the operator at once."""
 
     def __post_init__(self) -> None:
-        from triaxcald.pipeline import Pipeline  # whoever only records needs none of the metrology
+        from triaxcald.pipeline import Pipeline  # a mere recording needs no metrology
 
         self.pipelines = {s: Pipeline(self.bundle, s) for s in self._names()}
         super().__post_init__()
@@ -233,21 +232,20 @@ class Collection(Recorded):
         targets: Sequence[tc.planning.Direction] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Records until ``stream`` shows ``wanted`` distinct poses, and of the
-        readings the first of them once more, if the plan says so; ``tell`` is
-        told how it goes. ``apart_from`` and ``targets`` as in `guide`. A device
-        that sends, but no whole sample of ``stream``, hears of it.
+        """Record until ``stream`` shows ``wanted`` distinct poses, and of the readings
+        the first pose once more if the plan wants it.
 
-        Raises NoPoses when no new pose has come for the plan's patience, and
-        what the device's stream raises. Where only the repeat does not come, it
-        goes on without.
+        ``tell`` receives the guidance. ``apart_from`` and ``targets`` as in `guide`. A
+        device that sends no complete sample of ``stream`` is reconnected. Raises
+        NoPoses if no new pose comes for ``plan.patience_s``, and the errors of the
+        device's stream. A missing repeat alone is no error.
         """
         pipeline = self.pipelines[stream]
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
-        lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
+        lost_s = self.gaps_s  # the time of an interruption does not count as time without a pose
         counted_s: tuple[float, ...] = ()
         if stream == READINGS and targets is None:
-            tc.planning.directions(wanted)  # put in order once, before there are samples to lose
+            tc.planning.directions(wanted)  # computed once, before samples can get lost
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for batch in records:
@@ -290,34 +288,30 @@ class Collection(Recorded):
 
 
 def _interrupted(batch: RawBatch) -> bool:
-    """Whether an interruption begins: what comes after it is another stream,
-    which has its own time to bring a sample."""
+    """Whether an interruption begins; the stream after it gets a new time-out."""
     return batch.gap is not None and batch.gap.to_ns is None
 
 
 class _Watch:
-    """Sees that one stream goes on; a device may go on sending another and
-    never this one.
+    """Detects a silent stream of a device that sends others.
 
-    The time counts from the first look: before that the driver may have been
-    discarding what was sampled earlier. From one look to the next no more of it
-    counts than `SILENCE_SHARE`: where this process was kept from looking,
-    samples wait unread.
+    The time counts from the first look: before it the driver may have discarded old
+    samples. Between two looks at most `SILENCE_SHARE` of the time-out counts, since
+    samples wait unread while this process is stalled.
     """
 
     def __init__(self, decoded: DecodedStream, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
-        self._samples, self._looks = -1, Looks(0.0, 0.0)
+        self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
         self._before: Counter[str] = Counter()
 
     def look(self, device: Streaming) -> None:
-        """Complains to the device, and begins anew, where none came for too
-        long."""
+        """Complain to the device after a time-out without a sample, and begin anew."""
         now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
-            self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
+            self._samples, self._timer = samples, StallTolerantTimer(now_s, SILENCE_SHARE * self._timeout_s)
             self._before = Counter(self._decoded.counts)
-        elif self._looks.look(now_s) > self._timeout_s:
-            self._samples, self._looks = -1, Looks(0.0, 0.0)
+        elif self._timer.update(now_s) > self._timeout_s:
+            self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
             what = text.no_sample(self._timeout_s, self._decoded.counts - self._before)
             device.complain(DeviceSilent(f"{self._stream}: {what}"))

@@ -1,5 +1,5 @@
-"""The station file: which units are where, how they are to be measured, and
-what is good enough."""
+"""The station file: units and their places, the plan of their measurement, and the
+limits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml, validate
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
-from triaxcald.station.coming_back import Patience, claimed, until_open
+from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -147,8 +147,8 @@ class StationFile(Strict):
         return tc.Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
     def stated(self, profile: Profile) -> tc.Stated:
-        """What the station says of uncertainties, and the device's ``profile``
-        of its thermal sensitivity."""
+        """Uncertainties stated by the station file, and the thermal sensitivity stated
+        by the device's ``profile``."""
 
         own = self.thermal_sensitivity_per_k
         return tc.Stated.at(
@@ -205,7 +205,7 @@ def _farthest_apart_deg(count: int) -> float:
 
 @dataclass(frozen=True)
 class Place:
-    """A unit with everything it takes to talk to it."""
+    """A unit with its profile and its bus settings."""
 
     unit: Unit
     bundle: Bundle
@@ -213,7 +213,7 @@ class Place:
 
     @property
     def address(self) -> str:
-        """Where the unit is, for messages."""
+        """Address of the unit, for messages."""
         return ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
 
     @property
@@ -229,17 +229,16 @@ class Place:
     @asynccontextmanager
     async def opened(
         self,
-        patience: Patience | None = None,
+        policy: RetryPolicy | None = None,
         tell: Callable[[Exception], None] = lambda _: None,
         identify: Callable[[Device], Awaitable[None]] | None = None,
     ) -> AsyncIterator[Device]:
-        """The device, open and nobody else's until the context ends. Raises
-        DeviceInUse; BusError, DeviceAbsent and what ``identify`` does, with
-        ``patience`` once that ends (``tell`` is told meanwhile), as that is for
-        DeviceInUse too.
+        """The device, open and claimed until the context ends.
 
-        Whoever closes it and opens it again in between, as a reset does, keeps
-        it.
+        Raises DeviceInUse, BusError, DeviceAbsent and the errors of ``identify``.
+        With ``policy`` these are retried first, DeviceInUse only if the policy says
+        so; ``tell`` receives each error meanwhile. The claim stays if the device is
+        closed and opened in between, as a reset does.
         """
         device = self.device()
 
@@ -248,9 +247,9 @@ class Place:
             if identify is not None:
                 await identify(device)
 
-        async with claimed(claim_of(self.bus), patience, tell):
+        async with claimed(claim_of(self.bus), policy, tell):
             try:
-                await (attempt() if patience is None else until_open(attempt, patience, tell))
+                await (attempt() if policy is None else until_open(attempt, policy, tell))
                 yield device
             finally:
                 with suppress(DriverError):
@@ -342,8 +341,8 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
 
 
 def _check_roles(bundle: Bundle, *, where: str) -> None:
-    """Only the daemon knows the effects, whose coefficients are roles. Raises
-    InputError with the nearest one."""
+    """Check the roles of a profile; coefficients of effects are roles too, and only the
+    daemon knows them. Raises InputError with the nearest role."""
     known = list(LINEAR_ROLES)
     if any(r.role not in (None, *known, *OTHER_ROLES) for r in bundle.profile.registers.values()):
         known += [f"{e.name}.{c.name}" for e in tc.effects.CATALOGUE for c in e.coefficients]
@@ -356,18 +355,18 @@ def _check_roles(bundle: Bundle, *, where: str) -> None:
             )
 
 
-# What of a station is another, once its file has been written anew.
+# Changes of a station between two readings of its file.
 
 
 def names_in(station: Station) -> set[str]:
-    """Of its units and buses."""
+    """Names of the station's units and buses."""
     return {place.unit.name for place in station.places} | {bus.name for bus in station.buses}
 
 
 def changed(before: Station, after: Station) -> set[str]:
-    """Names of units and buses that are gone, new, or not as they were. All are,
-    where the station says something else of itself: each recording holds the
-    station file by which it is read."""
+    """Names of removed, new and changed units and buses. All names, if the station's
+    own entries changed: each recording contains the station file by which it is
+    read."""
     if _itself(before) != _itself(after):
         return names_in(before) | names_in(after)
     old, new = _each(before), _each(after)
@@ -405,11 +404,11 @@ class SerialsSeen:
             raise SerialTwice(f"serial {serial} answers in two places: {places}")
 
     def discard(self, unit: str) -> None:
-        """What this unit has reported."""
+        """Forget the serial number of this unit."""
         self._places = {serial: place for serial, place in self._places.items() if place[0] != unit}
 
 
-# The calendar: the one place where the date of today enters.
+# The date: the one place that reads the calendar.
 
 DAY_S = 86_400
 
@@ -419,14 +418,16 @@ def days_since_1970(now_s: float | None = None) -> int:
     return int((time.time() if now_s is None else now_s) // DAY_S)
 
 
-# What units and listeners of a station share: whether a line carries those who are
-# on it, and whether they drive it alike.
+# Shared lines of a station: their load, and equal settings of all their users.
 
 
 def check_lines(places: Sequence[Place], buses: Sequence[BusPlace] = (), *, where: str) -> None:
-    """Every shared line carries those of its units that are recorded, and all
-    of them drive it alike, who listens too. A unit alone has what the line
-    gives, and its losses are counted. Raises InputError with the arithmetic."""
+    """Check that every shared line can carry its recorded units, and that all its
+    users, listeners too, have equal settings.
+
+    The load of a line with one unit is not checked: its losses are counted. Raises
+    InputError with the arithmetic.
+    """
     _check_buses(places, buses, where=where)
     lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
     for i, place in enumerate(places):

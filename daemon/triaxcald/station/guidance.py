@@ -1,5 +1,4 @@
-"""What to tell the operator: how many poses are there, is it still now, where
-to turn next. Pure."""
+"""Guidance of the operator: poses so far, present stillness, next direction. Pure."""
 
 from __future__ import annotations
 
@@ -11,22 +10,21 @@ import numpy as np
 import triaxcal as tc
 
 COVERED_DEG = 25.0
-"""A pose covers the direction of the plan that it is nearest to, up to this far
-off."""
+"""Largest angle between a pose and the direction of the plan that it covers."""
 SAME_DEG = 10.0
-"""A repeated pose need not be nearer to the first than this, however near
-others may be to each other."""
+"""Angle to the first pose that always suffices for its repetition, however close other
+poses are to each other."""
 
 
 @dataclass(frozen=True)
 class Guide:
-    """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has
-    been still now (0 when it moves).
+    """State of a pose acquisition: ``found`` of ``wanted`` distinct poses; ``held_s``
+    is the present time of stillness (0 during a motion).
 
-    ``missing`` are the labels of the plan's poses that none has come near to,
-    in the plan's order. ``repeat_due`` says that the first pose is wanted once
-    more, after all others. ``counted_s`` are times inside the poses that were
-    long enough, for the next look.
+    ``missing`` are the labels of the uncovered poses of the plan, in its order.
+    ``repeat_due``: the first pose is wanted once more, after all others.
+    ``counted_s`` are times inside the poses that were long enough, for the next
+    evaluation.
     """
 
     found: int
@@ -37,7 +35,7 @@ class Guide:
     repeat_due: bool = False
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
-    """The poses keep coming where they were not wanted, and have to do."""
+    """Whether poses keep coming in unwanted directions, so that they must suffice."""
 
     @property
     def complete(self) -> bool:
@@ -61,16 +59,16 @@ def guide(
     """Judge the poses so far, which may come in any order; ``repeat`` asks for
     the first of them again at the end.
 
-    With ``apart_from`` (n,3), directions of up, only poses apart from those
-    count. Who offers none of these is asked no longer once twice as many others
-    have come as are wanted, or as many as there are to be apart from.
+    With ``apart_from`` (n,3), directions of up, only poses apart from those count.
+    The request for such poses ends once twice ``wanted`` other poses have come, or as
+    many as ``apart_from`` has.
 
-    ``targets`` are the directions to ask for, by default those of a plan of so
-    many poses.
+    ``targets`` are the wanted directions, by default those of a plan with ``wanted``
+    poses.
 
-    ``now_s`` is the time of the latest sample, counted as the poses' times are.
-    A pose that lies about one of ``counted_s`` was long enough once: it stays
-    so where its ends have moved since, as more of the noise was seen.
+    ``now_s`` is the time of the latest sample, on the time scale of the poses. A pose
+    around one of ``counted_s`` was long enough before: it still counts if its ends
+    have moved, as the estimate of the noise improved.
     """
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.

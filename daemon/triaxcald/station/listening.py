@@ -1,4 +1,4 @@
-"""A bus that is listened to, across the times in which it cannot be."""
+"""Recording of a bus, across interruptions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from triaxcal_drivers.host_clock import HOST, SteadyClock, slept_ns
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 from triaxcald.recording.schema import RawDigest
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Patience, until_open
+from triaxcald.station.reconnect import RetryPolicy, until_open
 
 if TYPE_CHECKING:
     from triaxcal_drivers.can.line import BusListener
 
 
-# Raw records on their way to disk, with what was lost of them.
+# Raw records on their way to disk, with a count of the lost ones.
 
 OVERRUN = "the disk did not keep up"
 
@@ -46,8 +46,8 @@ class RawRecords:
     async def written(
         self, stream: AsyncGenerator[RawBatch], writer: RecordingWriter | None
     ) -> AsyncGenerator[RawBatch]:
-        """The batches of a stream, which is closed in the end, once they are on
-        their way to disk, and without those that it had no room for."""
+        """Batches of a stream after their hand-over to the writer, without those that
+        it drops; closes the stream at the end."""
         unwritten: Gap | None = None
         away = None if writer is None else writer.resumes
         stepped_ns = self.clock.steps_ns()
@@ -91,55 +91,54 @@ class RawRecords:
 
 
 def _unwritten(before: Gap | None, batch: RawBatch) -> Gap:
-    """The gap that grows while the disk has no room."""
+    """The growing gap of a writer that drops records."""
     lost = len(batch) + (before.lost or 0 if before else 0)
     from_ns = int(batch.time_ns[0]) if before is None else before.from_ns
     return Gap(from_ns, None, OVERRUN, lost)
 
 
 SETTLED_S = 1.0
-"""A bus is back where it brings a frame, or does not fail for so long."""
+"""A bus is back once it brings a frame, or works for this time without an error."""
 SLEPT_S = 0.1  # reading two clocks takes microseconds, on a busy machine some milliseconds
 SLEPT = "this machine slept"
 IDENTIFIERS_MOST = 1 << 16
-"""So many different ones are told apart; a bus in use has some hundred, and one
-of random identifiers is to take no memory."""
+"""Number of identifiers that are counted separately: a bus in use has some hundred, and
+random identifiers must not fill the memory."""
 
 
-class ReturningBus:
-    """A bus whose frames go on after an interruption.
+class ReconnectingBus:
+    """A bus whose frames continue after an interruption.
 
-    Silence is no loss on it, as nobody has to send: what tells of a loss is
-    that the bus fails, or that this machine slept. So a gap ends when the bus
-    is open again, and begins at the last frame or the last look at a quiet
-    bus, whichever is later. ``tell`` is told what is the matter, and None when
-    it is over.
+    Silence is no loss, since no node has to send: only a failure of the bus or a
+    sleep of this machine is one. So a gap begins at the last frame or the last look
+    at a quiet bus, whichever is later, and ends when the bus is open again. ``tell``
+    receives the reason of an interruption, and None when it is over.
     """
 
     def __init__(
         self,
         listener: BusListener,
-        patience: Patience,
+        policy: RetryPolicy,
         tell: Callable[[str | None], None],
         *,
         now_ns: Callable[[], int] = HOST.now_ns,
         slept_ns: Callable[[], int] = slept_ns,
     ) -> None:
-        self._listener, self._patience, self._tell = listener, patience, tell
+        self._listener, self._policy, self._tell = listener, policy, tell
         self._now_ns, self._slept_ns = now_ns, slept_ns
         self._opened_ns = 0
 
     async def stream(self) -> AsyncGenerator[RawBatch, None]:
-        """As the listener's own. A batch without records tells of an
-        interruption by a gap that is not over, another one of its end; the
-        first record after it carries RawFlag.LOST_BEFORE. Raises BusError once
-        patience ends."""
+        """The listener's batches. An empty batch with an open gap reports an
+        interruption, another one its end; the first record after it carries
+        RawFlag.LOST_BEFORE. Raises BusError once the policy gives up."""
         heard_ns, asleep_ns, lost = self._now_ns(), self._slept_ns(), False
         while True:
             try:
                 async with aclosing(self._listener.stream()) as stream:
                     async for batch in stream:
-                        # A thread that is kept between its two clocks reads too little.
+                        # A thread that stalls between its two clock readings gets too
+                        # small a value.
                         before_ns, asleep_ns = asleep_ns, max(asleep_ns, self._slept_ns())
                         if asleep_ns - before_ns > SLEPT_S * 1e9:
                             yield RawBatch.of([]).after(Gap(heard_ns, heard_ns + asleep_ns - before_ns, SLEPT))
@@ -154,7 +153,7 @@ class ReturningBus:
                 gap = Gap(heard_ns, None, str(e))
             yield RawBatch.of([]).after(gap)
             self._tell(gap.cause)
-            await until_open(self._again, self._patience, lambda trouble: self._tell(str(trouble)))
+            await until_open(self._again, self._policy, lambda trouble: self._tell(str(trouble)))
             heard_ns, asleep_ns, lost = self._opened_ns, self._slept_ns(), True
             yield RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
             self._tell(None)
@@ -182,9 +181,9 @@ class Listened(RawRecords):
         most."""
         return {"frames": self.frames, "identifiers": len(self._seen), "errors": self.errors}
 
-    async def for_seconds(self, bus: ReturningBus, writer: RecordingWriter, seconds: float | None) -> None:
-        """Records for so many seconds of the host's time, whatever comes in
-        them; for ever where None. Raises BusError once the bus is given up."""
+    async def for_seconds(self, bus: ReconnectingBus, writer: RecordingWriter, seconds: float | None) -> None:
+        """Record for ``seconds`` of the host's time (None: without end), however many
+        frames come. Raises BusError once the policy gives up."""
         now_s = asyncio.get_running_loop().time
         begun_s = now_s()
         try:

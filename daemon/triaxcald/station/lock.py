@@ -1,12 +1,11 @@
-"""One command at a time on a device, and on a serial port, whichever process or
-user it is of.
+"""Locks: one command at a time on a device and on a serial port, across processes and
+users.
 
-The kernel keeps a lock (flock) on a file for each and releases it when the
-process ends, however it ends. What a file holds only says who has locked it;
-what a killed process left there means nothing. The files lie in one folder for
-all users of the machine, and stay there: somebody may be about to lock one.
-Where there is no flock (outside POSIX) commands of one process exclude each
-other, and processes do not.
+The kernel keeps a lock (flock) on a file for each and releases it at every end of
+the process. The content of a file only names the holder; that of a killed process
+has no meaning. The files lie in one folder for all users of the machine, and stay
+there, since another process may be about to lock one. Without flock (outside POSIX)
+only commands of one process exclude each other.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ except ImportError:
     fcntl = None  # type: ignore[assignment]
 
 FOLDER_VARIABLE = "TRIAXCAL_LOCK_FOLDER"
-"""For processes that share neither /run/lock nor /tmp, as in containers, and
-where neither can be written to. All of them must be given the same folder."""
+"""Names the folder for processes that share neither /run/lock nor /tmp, as in
+containers, or cannot write there. All of them need the same folder."""
 _FOLDERS = ("/run/lock", "/tmp")
 _LOOKUP_S = 2.0
-"""A name that takes longer to look up is locked by its spelling; connecting by
-it will fail as well."""
+"""A host name with a slower lookup is locked by its spelling; a connection to it will
+fail as well."""
 _TRIES, _PAUSE_S = 20, 0.01
-"""Who has a lock says so in its file right after; nobody waits longer for that."""
+"""A new holder writes its name right after locking; the wait for it is this long."""
 _HOLDER_BYTES, _COMMAND_LENGTH = 4096, 200
 
 
@@ -93,11 +92,11 @@ _held: dict[str, _Held] = {}
 
 @asynccontextmanager
 async def locked(claim: Claim) -> AsyncIterator[None]:
-    """Has what is claimed until the context ends. Units of one process share
-    its serial port.
+    """Hold the claim until the context ends. Units of one process share its serial
+    port.
 
-    Raises DeviceInUse, which names the holder; StationError where a lock's file
-    is not to be had.
+    Raises DeviceInUse with the holder; StationError if the file of a lock cannot be
+    made.
     """
     with ExitStack() as stack:
         if claim.serial_port is not None:
@@ -117,8 +116,8 @@ async def _lock(name: str, stack: ExitStack, *, shared: bool = False) -> None:
 
 
 def _taken(name: str, shared: bool) -> bool:
-    """False where it has to be tried again, because a new holder has not yet
-    said who it is."""
+    """Take a lock; False if it has to be tried again, because a new holder has not yet
+    written its name."""
     held = _held.get(name)
     if held is not None and not shared:
         raise DeviceInUse(f"{name} is in use by {held.holder}")
@@ -153,9 +152,9 @@ def _release(name: str) -> None:
 
 
 def _remedy(e: OSError) -> str:
-    """Where no file can be made. No other folder is tried: a command for which
-    this one is read-only, as in a container, would hold the device beside one
-    that can write to it."""
+    """Hint for a lock file that cannot be made. No other folder is tried: a command
+    for which this one is read-only, as in a container, would then use the device at
+    the same time as one that can write to it."""
     if e.errno == errno.EEXIST:
         return ""
     if os.environ.get(FOLDER_VARIABLE):
@@ -181,7 +180,7 @@ def _flocked(path: Path, content: Mapping[str, Any]) -> int:
         except BlockingIOError:
             raise _Locked(Holder.said_in(os.pread(descriptor, _HOLDER_BYTES, 0))) from None
         if not _is_at(path, descriptor):
-            raise _Locked(None)  # somebody has just cleaned the folder: the lock is of a file that is no more
+            raise _Locked(None)  # the folder was just cleaned: the lock is on a deleted file
         with suppress(OSError):  # a full disk takes the holder's name away, not the lock
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, json.dumps(content).encode(), 0)
@@ -225,8 +224,8 @@ def file_name(name: str) -> str:
 
 
 def folder() -> Path:
-    """Where the locks of this machine are; the same for all its users, hence no
-    matter of what one may write."""
+    """The folder of this machine's locks: the same for all users, whatever their
+    rights."""
     chosen = os.environ.get(FOLDER_VARIABLE)
     if chosen:
         return Path(chosen)
@@ -255,6 +254,5 @@ async def _addresses(host: str | None) -> Sequence[str | None]:
 
 
 def _printable(text: object) -> str:
-    """On one line: a command may hold anything, and anybody can write into a
-    lock's file."""
+    """Printable text on one line: any user can write into the file of a lock."""
     return "".join(c if c.isprintable() else "?" for c in str(text))[:_COMMAND_LENGTH]

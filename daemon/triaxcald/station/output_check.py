@@ -10,24 +10,24 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, RawBatch, SampleBlock
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcal_drivers.stall_clock import StallTolerantClock
 from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
-from triaxcald.provision.registers import Doubt, Snapshot, departure_g, doubt_of_departure
+from triaxcald.provision.registers import SanityWarning, Snapshot, departure_g, departure_warnings
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import ABSENT, Exchanged, Streaming
+from triaxcald.station.reconnect import ABSENT, Exchanged, Streaming
 
 SAMPLES = 20
 """Their median is not moved by a knock, and at the slowest usual rate they take
 two seconds."""
 
 
-async def doubts_of_live_output(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[Doubt]:
+async def live_output_warnings(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[SanityWarning]:
     """None where the device has no corrected output, or where it does not come."""
     if CORRECTED not in bundle.profile.streams:
         return []
@@ -38,7 +38,7 @@ async def doubts_of_live_output(device: Device, bundle: Bundle, snapshot: Snapsh
     _, mine, theirs = np.intersect1d(readings[0], outputs[0], return_indices=True)
     channels = {name: values[mine] for name, values in readings[2].items()}
     off_g = departure_g(bundle.profile, snapshot, readings[1][mine], outputs[1][theirs], channels)
-    return doubt_of_departure(off_g)
+    return departure_warnings(off_g)
 
 
 async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[SampleBlock]]) -> None:
@@ -46,8 +46,8 @@ async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[Sample
     decoders = {name: driver.decoder(bundle, name) for name in blocks}
     # So long even if one of the two never comes.
     limit_s = sampling.silence_timeout_s + 2 * SAMPLES / sampling.rate_hz
-    with closing(Attention(asyncio.get_running_loop())) as attention:
-        async with attention.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
+    with closing(StallTolerantClock(asyncio.get_running_loop())) as clock:
+        async with clock.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
             async for batch in stream:
                 for name, decoder in decoders.items():
                     blocks[name].append(decoder.feed(batch))
@@ -63,49 +63,50 @@ def _joined(blocks: list[SampleBlock]) -> tuple[Any, Any, dict[str, Any]]:
     return np.concatenate([b.counter for b in blocks]), np.concatenate([b.readings for b in blocks]), channels
 
 
-# Asks a unit again, while it is recorded, whether it is still the one that it was:
-# behind a gateway it can be exchanged without a gap in its stream.
+# Confirms the identity of a unit during a recording: behind a gateway a unit can be
+# exchanged without a gap in its stream.
 
 EVERY_S = 45.0
-"""Once a minute is promised; the rest of it is for a request that goes
-unanswered."""
+"""Period of the confirmation. The documentation promises one a minute; the remaining
+time covers an unanswered request."""
 RETRY_S = 10.0
-"""After a request that went unanswered; doubled up to `EVERY_S`, so that a unit
-that answers nothing while it streams is not disturbed for nothing."""
+"""Pause after an unanswered request; doubled up to `EVERY_S`, since some units answer
+nothing while they stream."""
 SURE_S = 0.2
-"""Between two readings of a wrong identity: a single one ends no recording."""
+"""Time between two readings of a wrong identity: a single one ends no recording."""
 STARTING_S = 3.0
-"""So long a unit that starts may show a blank identity: a device has loaded its
-registers in a second or two."""
+"""Time in which a starting unit may show a blank identity: a device loads its
+registers within a second or two."""
 LAST_ATTEMPTS = 3
-"""At the end of a phase nobody asks later: a lost reply is not the last word."""
+"""Requests at the end of a phase, since a reply may get lost and no later request
+follows."""
 LAST_S = 2.0
-"""So long a recording that is stopped is held up for it."""
+"""Time limit of the last confirmation of a stopped recording."""
 
 
-class Marked(Protocol):
-    """What the recorded records have come to so far, to be brought back where
-    the later ones turn out to be of another unit."""
+class Checkpointed(Protocol):
+    """Recorded counts with checkpoints, to discard records that turn out to be of
+    another unit."""
 
-    def mark(self) -> object: ...
+    def checkpoint(self) -> object: ...
 
-    def back_to(self, mark: Any) -> None: ...
+    def roll_back(self, checkpoint: Any) -> None: ...
 
 
 class Confirmation:
-    """Who a unit is, asked again while it is recorded.
+    """Confirmation of a unit's identity during its recording.
 
-    ``identify`` reads who answers, and raises WrongUnit where that is another
-    unit; None where the unit has no register that says so, and then nothing is
-    asked. ``tell`` is told once of a unit that does not answer. ``wrong`` is
-    what the other unit was noticed by.
+    ``identify`` reads the identity, and raises WrongUnit if another unit answers;
+    None if the unit has no register for it, so nothing is requested. ``tell``
+    receives one message about a unit that does not answer. ``wrong`` is the error of
+    a noticed exchange.
     """
 
     def __init__(
         self,
         identify: Callable[[], Awaitable[None]] | None,
         writer: RecordingWriter | None,
-        recorded: Marked,
+        recorded: Checkpointed,
         tell: Callable[[str], None] = lambda _: None,
         now_ns: Callable[[], int] = HOST.now_ns,
     ) -> None:
@@ -119,20 +120,21 @@ class Confirmation:
         self._confirmed = self._here()
 
     def _here(self) -> tuple[int, int, object]:
-        """Up to now: running index of the raw records, host time, and what they
-        have come to."""
-        return 0 if self._writer is None else self._writer.offered, self._now_ns(), self._recorded.mark()
+        """The present point: running index of the raw records, host time, and
+        checkpoint of the counts."""
+        return 0 if self._writer is None else self._writer.offered, self._now_ns(), self._recorded.checkpoint()
 
     @property
     def unconfirmed(self) -> int:
-        """How many raw records have been marked as unconfirmed."""
+        """Number of raw records that are marked as unconfirmed."""
         return self._writer.offered - self._confirmed[0] if self._marked and self._writer is not None else 0
 
     async def returned(self, identify: Callable[[], Awaitable[None]]) -> None:
-        """Identifies a unit that was lost and is opened again. Raises Exchanged
-        where records have come since the right one was confirmed and another
-        unit answers, unless the right one does at the second reading. Else
-        raises what ``identify`` does."""
+        """Identify a unit after a reconnection.
+
+        Raises Exchanged if records have come since the last confirmation and another
+        unit answers at two readings. Raises the other errors of ``identify``.
+        """
         async with self._turn:
             try:
                 await identify()
@@ -150,8 +152,8 @@ class Confirmation:
                 self._confirmed = self._here()
 
     async def ask(self) -> bool:
-        """Whether the unit has answered. What came up to the request is the
-        right unit's where it answers as such."""
+        """Request the identity; whether the unit has answered. The right answer
+        confirms all records before the request."""
         if self._identify is None or self.wrong is not None:
             return True
         async with self._turn:
@@ -166,7 +168,7 @@ class Confirmation:
             except TwoAnswer as e:
                 self._two = e
                 raise
-            except ABSENT as e:  # silent, busy or refusing is not wrong
+            except ABSENT as e:  # a silent, busy or refusing unit is not a wrong one
                 self._note(str(e))
                 return False
             else:
@@ -182,16 +184,17 @@ class Confirmation:
             self._writer.event("identity_unanswered", {"error": trouble})
 
     def of(self, device: Streaming) -> Confirmed:
-        """The device, whose stream ends with WrongUnit once another unit is
-        noticed."""
+        """The device, whose stream raises WrongUnit once another unit is noticed."""
         return Confirmed(device, self)
 
     @asynccontextmanager
     async def phase(self) -> AsyncIterator[None]:
-        """While one phase is recorded. At its end, also when it is cancelled,
-        the unit is asked once more. Where another unit is noticed, also beside
-        the right one, all that came since the unit was confirmed is marked as
-        unconfirmed. Raises WrongUnit, TwoAnswer."""
+        """Confirms the unit at the end of a recorded phase, also of a cancelled one.
+
+        If another unit is noticed, even together with the right one, all records
+        since the last confirmation are marked as unconfirmed. Raises WrongUnit,
+        TwoAnswer.
+        """
         try:
             yield
         except WrongUnit as e:
@@ -218,21 +221,21 @@ class Confirmation:
                 return
 
     def disown(self, why: Exception) -> None:
-        """Marks what came since the unit was confirmed as unconfirmed. Raises
+        """Mark the records since the last confirmation as unconfirmed. Raises
         RecordingError."""
         if self._writer is None:
             return
-        first, confirmed_ns, mark = self._confirmed
+        first, confirmed_ns, checkpoint = self._confirmed
         if self._writer.offered == first or self._marked:
             return
         self._marked = True
-        self._recorded.back_to(mark)
+        self._recorded.roll_back(checkpoint)
         self._writer.unconfirmed(first, {"confirmed_ns": confirmed_ns, "error": str(why)})
 
     def heed(self, batch: RawBatch) -> None:
-        """Raises WrongUnit once another unit is noticed, and what else the asking
-        has failed with. While the unit is lost it is not asked; after a hole in
-        its stream it is asked at once."""
+        """Take note of a batch. Raises WrongUnit once another unit is noticed, and
+        other errors of the requests. No request is sent while the unit is lost; one is
+        sent at once after a gap in its stream."""
         if batch.gap is not None:
             self._interrupted = batch.gap.to_ns is None
             if not self._interrupted:
@@ -244,7 +247,7 @@ class Confirmation:
 
     @asynccontextmanager
     async def keeping_on(self) -> AsyncIterator[None]:
-        """Asks now and then, beside the stream."""
+        """Requests the identity periodically during the stream."""
         if self._identify is None:
             yield
             return
@@ -256,7 +259,7 @@ class Confirmation:
             asking.cancel()
             await asyncio.wait([asking])
             if not asking.cancelled():
-                asking.exception()  # heard of by then
+                asking.exception()  # retrieved: `heed` has raised it
 
     async def _keep_asking(self) -> None:
         pause_s, retry_s = EVERY_S, RETRY_S
@@ -275,10 +278,12 @@ class Confirmation:
 
 
 async def _once_more(identify: Callable[[], Awaitable[None]], wrong: WrongUnit) -> None:
-    """After a wrong identity was read. Raises it unless the right one is read
-    `SURE_S` later; a blank one may be read for `STARTING_S` before, as of a unit
-    that is starting. Raises what ``identify`` does where nothing but blanks
-    have been read and the unit is absent."""
+    """Repeat the reading of a wrong identity.
+
+    Raises ``wrong`` unless the right identity is read `SURE_S` later. A starting
+    unit may show a blank identity for `STARTING_S` first. If only blanks were read
+    and the unit is absent, raises the error of ``identify``.
+    """
     blank = isinstance(wrong, BlankIdentity)
     for _ in range(round(STARTING_S / SURE_S) if blank else 1):
         await asyncio.sleep(SURE_S)
@@ -295,7 +300,7 @@ async def _once_more(identify: Callable[[], Awaitable[None]], wrong: WrongUnit) 
 
 
 class Confirmed:
-    """To be had by `Confirmation.of`."""
+    """The stream of a device with confirmation; made by `Confirmation.of`."""
 
     def __init__(self, device: Streaming, confirmation: Confirmation) -> None:
         self._device, self._confirmation = device, confirmation

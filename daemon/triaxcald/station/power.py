@@ -13,8 +13,8 @@ from triaxcald.station.config import Place, Station
 def power_cycle_asked(
     ask: Callable[[str], None], link: RegisterLink, place: Place, station: Station
 ) -> Callable[[], Awaitable[bool]]:
-    """For `Provisioning.power_cycle`: whether the supply was seen off and on
-    within the plan's patience."""
+    """The function for `Provisioning.power_cycle`: asks the operator, and returns
+    whether a power cycle was seen within ``plan.patience_s``."""
 
     async def asked() -> bool:
         ask(text.switch_supply(least_off_s(place.bundle.profile)))

@@ -1,2 +1,2 @@
-"""Samples from tables: our own text, and the text tables and Parquet files that
+"""Samples from tables: the native CSV, and the text tables and Parquet files that
 other programs write."""

@@ -16,7 +16,7 @@ from triaxcald.tables import arrow
 from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
 from triaxcald.tables.naming import Unclear
-from triaxcald.tables.own_text import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
+from triaxcald.tables.native_csv import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
@@ -46,7 +46,7 @@ class Grid:
         return f"column {clipped(self.names[column])}" if self.named else f"column {column + 1}"
 
     @property
-    def is_own(self) -> bool:
+    def is_native(self) -> bool:
         """Whether it is of our own layout, as Parquet or as text: its columns
         come first, each name once, and the times may be seconds."""
         if not (self.ours and self.named and self.names[: len(REQUIRED)] == REQUIRED):

@@ -33,7 +33,7 @@ from triaxcald.tables.naming import (
     roles_of,
     seconds_and_rest,
 )
-from triaxcald.tables.own_text import REQUIRED, CsvSamples, header_of, is_applied, is_own, samples_of_blocks
+from triaxcald.tables.native_csv import REQUIRED, CsvSamples, header_of, is_applied, is_native, samples_of_blocks
 from triaxcald.tables.source import blocks, label_of, whole_lines
 
 # Which column of a table is the time, in which unit, or by which rate its samples
@@ -530,7 +530,7 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
         first = next(data, b"")
         if known := document_kind(first):
             raise Unclear(f"{known}, expected a recording (.mcap) or a table of samples")
-        own = replace(reading, wanted=frozenset()) == Reading() and is_own(first)
+        own = replace(reading, wanted=frozenset()) == Reading() and is_native(first)
         if own and holds_text(whole_lines(first)):
             grid = grid_of_own(b"".join(chain((first,), data)), label)
             return _table_of(grid, reading, beside, lacking=() if is_applied(grid.names) else _lacking(grid))
@@ -588,7 +588,7 @@ def _as_own(reading: Reading) -> Reading:
 
 def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int] = ()) -> Table:
     """``lacking`` are columns that have to have a number in each row too."""
-    given, reading = reading, _as_own(reading) if grid.is_own else reading
+    given, reading = reading, _as_own(reading) if grid.is_native else reading
     own = reading is not given
     chosen = rows_where(grid, reading.where)
     if grid.named and TIME not in reading.columns and not own:

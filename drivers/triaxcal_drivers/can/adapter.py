@@ -1,5 +1,4 @@
-"""What is behind a CAN bus: an open socket or adapter, which sends and
-receives."""
+"""The adapter of a CAN bus: an open socket or device that sends and receives."""
 
 from __future__ import annotations
 
@@ -38,9 +37,8 @@ class Adapter(Protocol):
         they are of a layout of the adapter's own."""
 
     def receive(self, timeout_s: float) -> list[Frame]:
-        """What has come, in order; nothing where nothing comes for
-        ``timeout_s``. Raises BusError where the bus has failed: interface gone
-        or down, adapter unplugged."""
+        """Received frames in order; none if none comes within ``timeout_s``. Raises
+        BusError if the bus has failed: interface gone or down, adapter unplugged."""
 
     def only(self, identifiers: Collection[Identifier] | None) -> None:
         """Frames of these identifiers and error frames are enough from now on;

@@ -60,8 +60,8 @@ so long."""
 RETURN = 32
 """A counter that goes back further than this has started anew."""
 CONTRADICTS = 0.1
-"""Of a gap: host time and the device's count of it differ by less, since no
-device's rate is a tenth off."""
+"""Tolerance for the length of a gap by host time and by the device's counter: no
+device's rate is off by a tenth."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,8 @@ class CanDecoder:
         self._origin = self._last_raw = self._last = self._top = self._settled = first
 
     def _extract(self, batch: RawBatch) -> tuple[_Parts, int, int]:
-        """Also how many records are in error, and how many of the stream's are
-        too short for their message: the bus carried these well."""
+        """Parts of samples in a batch, and the numbers of records in error and of
+        records too short for their message."""
         bad = (batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) != 0
         remote = (batch.flags & (RawFlag.REMOTE | RawFlag.FD)) == RawFlag.REMOTE
         message = self._messages(batch, ~bad & ~remote)
@@ -220,7 +220,8 @@ class CanDecoder:
         return _Parts(batch.time_ns[rows], message, counter, values, after_gap), int(bad.sum()), int(short.sum())
 
     def _after_gap(self, batch: RawBatch, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Of the records ``rows``, also where the mark is on another's."""
+        """Whether a gap precedes each of the records ``rows``, also if a record of
+        another stream carries the flag."""
         gaps = self._gaps + np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
         after = np.diff(gaps[rows], prepend=self._gaps_at_last) > 0
         self._gaps = int(gaps[-1]) if len(gaps) else self._gaps
@@ -253,7 +254,8 @@ class CanDecoder:
         return self._block(time_ns, counter, parts.values)
 
     def _by_time(self, parts: _Parts) -> SampleBlock:
-        """What belongs to a sample that is not whole yet is held."""
+        """Join parts to samples; parts of an incomplete sample are kept for the next
+        batch."""
         sample = np.concatenate(
             [np.zeros(len(self._held), dtype=np.int64), self._together.samples_of(parts.time_ns, parts.message)]
         )

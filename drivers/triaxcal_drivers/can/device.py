@@ -15,7 +15,6 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.line import BATCH_FRAMES, CanLine, FrameQueue, join, leave
@@ -31,15 +30,16 @@ from triaxcal_drivers.errors import (
 )
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, RawBatch, RawFlag
+from triaxcal_drivers.stall_clock import TICK_S, StallTolerantClock
 from triaxcal_drivers.two_senders import Answers, ExtraAnswer
 
 T = TypeVar("T")
 
 _NMT_START = 1
 _HEARTBEAT, _BOOTED = 0x700, b"\0"
-"""Of CiA 301: a node that has booted says so by a heartbeat of state 0."""
+"""CiA 301: a node sends a heartbeat of state 0 after booting."""
 _BOOT_LOOK_S = 0.1
-"""How often a stream that brings nothing looks whether the node has booted."""
+"""How often a stream that brings nothing checks whether the node has booted."""
 _ABORTED, _ABORT = 0x80, b"\x80"
 _DOWNLOAD, _UPLOAD = 1, 2
 _BEGINS = (2, 3)
@@ -50,7 +50,7 @@ transfers, then segments."""
 
 
 class PatientSdo(SdoClient):
-    """canopen's client, whose time-out counts attention, and which takes no
+    """canopen's client, whose time-out tolerates stalls, and which takes no
     answer to somebody else's request.
 
     It waits in a thread of its own, and where the event loop is held up so may
@@ -58,12 +58,12 @@ class PatientSdo(SdoClient):
     of the node, is skipped.
     """
 
-    def __init__(self, node_id: int, attention: Attention, answers: Answers[bytes]) -> None:
+    def __init__(self, node_id: int, clock: StallTolerantClock, answers: Answers[bytes]) -> None:
         self.answers = answers
         self._in_segments = False
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         super().__init__(0x600 + node_id, 0x580 + node_id, nothing_known)  # type: ignore[no-untyped-call]
-        self._attention = attention
+        self._clock = clock
         self._asked, self._object = 0, bytes(3)
 
     def send_request(self, request: bytes) -> None:
@@ -75,7 +75,7 @@ class PatientSdo(SdoClient):
         super().send_request(request)  # type: ignore[no-untyped-call]
 
     def receive(self, response: bytes) -> None:
-        """From the receive thread: each answer of the node, whoever asked."""
+        """Take an answer of the node to any client. Runs in the receive thread."""
         # Segments name no object: only the answer that begins a transfer counts.
         # An abort of the segments belongs to the same transfer.
         ends_segments = self._in_segments and response[:1] == _ABORT and self._named_by(response) == self._object
@@ -99,9 +99,9 @@ class PatientSdo(SdoClient):
         return response
 
     def _response(self) -> bytes:
-        deadline_s = self._attention.now_s() + self.RESPONSE_TIMEOUT
+        deadline_s = self._clock.now_s() + self.RESPONSE_TIMEOUT
         while True:
-            late = self._attention.now_s() >= deadline_s
+            late = self._clock.now_s() >= deadline_s
             with suppress(queue.Empty):
                 response = bytes(self.responses.get(timeout=TICK_S))
                 if self._is_mine(response):
@@ -120,7 +120,7 @@ class PatientSdo(SdoClient):
 
 
 class _Sender:
-    """In the place of canopen's network, which wants a bus of its own."""
+    """Replaces canopen's network, which needs a bus of its own."""
 
     def __init__(self, line: CanLine) -> None:
         self._line = line
@@ -166,9 +166,9 @@ class CanDevice:
         """Raises BusError, DeviceAbsent."""
         await self.close()
         line = await join(self._settings)
-        sdo = PatientSdo(self._settings.node_id, line.attention, self._answers)
+        sdo = PatientSdo(self._settings.node_id, line.clock, self._answers)
         sdo.network = cast(canopen.Network, _Sender(line))
-        self._connection = _Connection(line, FrameQueue(line.attention), sdo)
+        self._connection = _Connection(line, FrameQueue(line.clock), sdo)
         started = False
         try:
             if self._profile.canopen:
@@ -201,11 +201,11 @@ class CanDevice:
         return _HEARTBEAT + self._settings.node_id
 
     def _on_heartbeat(self, frame: Frame) -> None:
-        """In the receive thread."""
+        """Take a heartbeat. Runs in the receive thread."""
         booted, connection = self._booted, self._connection
         if frame.data == _BOOTED and booted is not None and connection is not None:
             with suppress(RuntimeError):  # the loop has ended
-                connection.line.attention.loop.call_soon_threadsafe(booted.set)
+                connection.line.clock.loop.call_soon_threadsafe(booted.set)
 
     async def _start(self) -> None:
         """NMT start, and the check that a device is there that has the registers
@@ -232,9 +232,9 @@ class CanDevice:
                 raise DeviceAbsent(f"{self._settings} is not a {identity.product}: {e}") from e
 
     async def _read_when_ready(self, register: str) -> bytes:
-        """As `read`; a node that refuses for now, as one does that starts or
-        stores, is asked again. Raises DeviceBusy after `BUSY_S`."""
-        now_s = self._connected().line.attention.now_s
+        """Read, and repeat the request while a starting or storing node refuses.
+        Raises DeviceBusy after `BUSY_S`."""
+        now_s = self._connected().line.clock.now_s
         until_s = now_s() + BUSY_S
         while True:
             try:
@@ -253,7 +253,7 @@ class CanDevice:
         BusError.
         """
         connection = self._connected()
-        frames, now_s = connection.frames, connection.line.attention.now_s
+        frames, now_s = connection.frames, connection.line.clock.now_s
         opened = frames.open(self._identifiers(names))
         booted = self._booted = asyncio.Event()
         connection.line.hear(frames)
@@ -319,7 +319,7 @@ class CanDevice:
         patience_s = self._profile.sampling.reply_timeout_s if timeout_s is None else timeout_s
 
         def locked() -> T:
-            with self._sdo_lock, connection.line.attention.watched():
+            with self._sdo_lock, connection.line.clock.thread_waiting():
                 connection.sdo.RESPONSE_TIMEOUT = patience_s
                 return transfer(connection.sdo)
 

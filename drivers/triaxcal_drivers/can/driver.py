@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from triaxcal_drivers.can.device import CanDevice
 
 STANDARD_BITS, EXTENDED_BITS = 47, 67
-"""Of a classic frame beside its data, with the three bits to the next and
-without stuffed ones (ISO 11898-1): a bus carries no more than by these."""
+"""Bits of a classic frame without its data, with the three bits to the next frame and
+without stuff bits (ISO 11898-1): a lower limit of the load."""
 
 
 class CanDriver:
@@ -40,9 +40,8 @@ class CanDriver:
         return CanDevice(profile, bus, {name: _layout(bundle, name) for name in profile.streams})
 
     def loads(self, bundle: Bundle, bus: CanBus) -> Mapping[str, LineLoad]:
-        """By stream, a message of several in the first of them alone; nothing
-        where no bit rate says how fast the bus is, or where frames of CAN FD may
-        be on it, whose data is faster."""
+        """Load of each stream; a message of several streams counts in the first. None
+        without a bit rate, or if the bus may carry CAN FD, whose data is faster."""
         if bus.bitrate is None or not bus.classic:
             return {}
         found: dict[str, LineLoad] = {}

@@ -1,5 +1,4 @@
-"""What a CAN error frame says, by SocketCAN's classes (linux/can/error.h). A
-pure function: bytes in, a value out."""
+"""Decodes a CAN error frame by SocketCAN's classes (linux/can/error.h). Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from enum import StrEnum
 
 
 class ControllerState(StrEnum):
-    """Of a CAN controller, by its error counters."""
+    """State of a CAN controller by its error counters."""
 
     ACTIVE = "error active"
     WARNING = "error warning"
@@ -19,7 +18,7 @@ class ControllerState(StrEnum):
 
 
 class ErrorClass(StrEnum):
-    """What an error frame may report; several at a time."""
+    """Errors in an error frame; it may report several."""
 
     TRANSMIT_TIMEOUT = "transmit timeout"
     ARBITRATION_LOST = "arbitration lost"
@@ -81,7 +80,7 @@ _CLASSES = {
     0x80: ErrorClass.BUS_ERROR,
     _RESTARTED: ErrorClass.RESTARTED,
 }
-"""By the bits of the frame's identifier; the controller's (0x04) are in byte 1."""
+"""Errors by bit of the identifier; those of the controller (0x04) are in byte 1."""
 
 _RECEIVE_OVERFLOW, _TRANSMIT_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x01, 0x02, 0x0C, 0x30, 0x40
 _SENDING = 0x80
@@ -129,8 +128,8 @@ _WIRES = {
 
 
 def error_frame(identifier: int, data: bytes) -> ErrorFrame:
-    """Of the identifier's 29 bits and the data of a frame with RawFlag.ERROR;
-    bytes that are not there count as zero."""
+    """Decode the 29-bit identifier and the data of a frame with RawFlag.ERROR; missing
+    bytes count as zero."""
     field = data.ljust(8, b"\0")
     classes = {named for bit, named in _CLASSES.items() if identifier & bit}
     state = _state(identifier, field[1])

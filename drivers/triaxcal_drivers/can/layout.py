@@ -1,5 +1,5 @@
-"""Where a stream's channels lie in its CAN messages, and their extraction for
-many frames at once. No I/O."""
+"""Layout of a stream's channels in its CAN messages, and their extraction from many
+frames at once. No I/O."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ class _Index:
         return held
 
     def _identifier(self, i: int) -> int:
-        """As the file has it."""
+        """Identifier of message ``i`` as in the file."""
         m = self._messages[i]
         return m.identifier + (self._node_id if m.per_node else 0)
 

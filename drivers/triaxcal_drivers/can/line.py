@@ -22,13 +22,13 @@ from importlib.util import find_spec
 from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Adapter, Frame, Identifier
 from triaxcal_drivers.can.error_frame import ErrorClass, error_frame
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
+from triaxcal_drivers.stall_clock import StallTolerantClock
 
 T = TypeVar("T")
 
@@ -52,8 +52,8 @@ def open_bus(settings: BusSettings) -> Adapter:
 
 
 async def opened(opening: Callable[[], T], closing: Callable[[T], object]) -> T:
-    """What ``opening`` gives, called in a thread, which closes it again where
-    nobody waits for it any more. Raises what ``opening`` does."""
+    """Result of ``opening`` in a thread, which closes it again if nobody waits for it
+    any more. Raises the errors of ``opening``."""
     given_up = threading.Event()
 
     def open_unless_given_up() -> T:
@@ -108,9 +108,9 @@ class FrameQueue:
     or on the bus, carries RawFlag.LOST_BEFORE.
     """
 
-    def __init__(self, attention: Attention, *, capacity: int = CAPACITY) -> None:
+    def __init__(self, clock: StallTolerantClock, *, capacity: int = CAPACITY) -> None:
         self.dropped = 0
-        self._attention = attention
+        self._clock = clock
         self._capacity = capacity
         self._lock = threading.Lock()
         self._frames: deque[tuple[Frame, _Loss | None]] = deque()  # and what was lost just before
@@ -150,8 +150,8 @@ class FrameQueue:
         return False
 
     def put(self, frames: Sequence[Frame], socketcan_errors: bool = True) -> None:
-        """From the receive thread. What error frames say is read where they are
-        SocketCAN's."""
+        """Take received frames. Error frames are decoded if they are SocketCAN's. Runs
+        in the receive thread."""
         wanted = self._identifiers
         if wanted is None or self._failure is not None:
             return
@@ -189,18 +189,18 @@ class FrameQueue:
         self._loss = loss.and_before(self._loss)
 
     def fail(self, failure: Exception) -> None:
-        """From the receive thread, when receiving has failed."""
+        """Take a failure of receiving. Runs in the receive thread."""
         self._failure = failure
         self._tell(self._some)
         self._tell(self._enough)
 
     def _tell(self, event: asyncio.Event) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended, and nobody is left to be told
-            self._attention.loop.call_soon_threadsafe(event.set)
+            self._clock.loop.call_soon_threadsafe(event.set)
 
     async def batch(self, timeout_s: float) -> RawBatch | None:
         """The next frames: up to 256, or those of 0.2 s, and none beyond the
-        next loss. None when nothing comes for ``timeout_s`` of attention.
+        next loss. None when nothing comes for ``timeout_s`` of the clock.
 
         Raises BusError when receiving has failed.
         """
@@ -211,7 +211,7 @@ class FrameQueue:
             nothing = not self._frames
         if nothing:
             try:
-                async with self._attention.timeout(timeout_s):
+                async with self._clock.timeout(timeout_s):
                     await self._some.wait()
             except TimeoutError:
                 if not self._frames:
@@ -259,10 +259,10 @@ class FrameQueue:
 _SENT, _NO_DATA = int(RawFlag.SENT), int(RawFlag.ERROR | RawFlag.REMOTE)
 
 POLL_S = 0.1
-"""How long closing waits for the receive thread to look up."""
+"""Period in which the receive thread checks for the closing."""
 JOIN_S = 2.0
-"""A driver that hangs in its own call is left to itself after this time: the
-bus is opened anew all the same."""
+"""Time to wait for a driver that hangs in a call; then the bus is opened anew without
+it."""
 MUTE_S = 5.0
 """A bus on which nobody was heard for so long is opened anew when a unit on it
 is: an adapter may hang without an error. Ten times the slowest heartbeat that
@@ -270,14 +270,14 @@ is usual on a bus in use."""
 
 
 class CanLine:
-    """To be had by `join`. ``attention`` is what its time-outs count;
-    ``openings`` counts how often it has been opened."""
+    """A shared CAN line; `join` gives it. ``clock`` measures its time-outs,
+    ``openings`` counts its openings."""
 
     def __init__(self, settings: BusSettings) -> None:
         self.settings = settings
         self.name = f"{settings.interface} {settings.channel}"
         self.users = self.openings = 0
-        self.attention = Attention(asyncio.get_running_loop())
+        self.clock = StallTolerantClock(asyncio.get_running_loop())
         self._opening = asyncio.Lock()
         self._adapter: Adapter | None = None
         self._thread: threading.Thread | None = None
@@ -287,9 +287,9 @@ class CanLine:
         self._failure: BusError | None = None
 
     async def open(self) -> None:
-        """Nothing where it is open and heard from. Raises BusError."""
+        """Open the line, unless it is open and receives frames. Raises BusError."""
         async with self._opening:
-            if self._adapter is not None and self.attention.now_s() - self._heard_s < MUTE_S:
+            if self._adapter is not None and self.clock.now_s() - self._heard_s < MUTE_S:
                 return
             try:
                 await self._close()
@@ -298,14 +298,14 @@ class CanLine:
                 self._fail(e if isinstance(e, BusError) else BusError(f"{self.name} is not open"))
                 raise
             self.openings += 1
-            self._adapter, self._failure, self._heard_s = adapter, None, self.attention.now_s()
+            self._adapter, self._failure, self._heard_s = adapter, None, self.clock.now_s()
             self._filter()
             self._thread = threading.Thread(target=self._receive, args=(adapter,), name=self.name, daemon=True)
             self._thread.start()
 
     async def close(self) -> None:
-        """Also the time-outs of all who still wait for something."""
-        self.attention.close()
+        """Close the line; the time-outs of all who still wait expire."""
+        self.clock.close()
         async with self._opening:
             await self._close()
 
@@ -376,7 +376,7 @@ class CanLine:
             queue.fail(failure)
 
     def _receive(self, adapter: Adapter) -> None:
-        """In a thread of its own, until the adapter is closed or fails."""
+        """Receive in a thread of its own, until the adapter is closed or fails."""
         while self._adapter is adapter:
             try:
                 frames = adapter.receive(POLL_S)
@@ -391,7 +391,7 @@ class CanLine:
                 return
             if frames:
                 if not all(frame.flags & _SENT for frame in frames):
-                    self._heard_s = self.attention.now_s()
+                    self._heard_s = self.clock.now_s()
                 HOST.steps_ns()
                 if HOST.stepped:
                     frames = [frame._replace(time_ns=HOST.steady_ns(frame.time_ns)) for frame in frames]
@@ -435,7 +435,7 @@ async def leave(line: CanLine) -> None:
     """Closes the bus once nobody uses it any more."""
     line.users -= 1
     if line.users == 0:
-        lines = _lines.get(line.attention.loop, {})
+        lines = _lines.get(line.clock.loop, {})
         for name in [name for name, known in lines.items() if known is line]:
             del lines[name]
         await line.close()
@@ -470,10 +470,10 @@ class BusListener:
         self._first: RawBatch | None = None  # which `settled` has seen
 
     async def open(self) -> None:
-        """What comes from now on is given. Raises BusError."""
+        """Open the bus; the stream has the frames from now on. Raises BusError."""
         await self.close()
         line = await join(self._settings)
-        frames = FrameQueue(line.attention, capacity=LISTENER_CAPACITY)
+        frames = FrameQueue(line.clock, capacity=LISTENER_CAPACITY)
         frames.open(None)
         self._connection = _Connection(line, frames, line.openings)
         line.hear(frames)

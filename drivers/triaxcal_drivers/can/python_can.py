@@ -66,8 +66,8 @@ def open_python_can(settings: BusSettings) -> can.BusABC:
 
 
 _SOCKETCAN_ERRORS = frozenset({"socketcan", "gs_usb", "socketcand", "udp_multicast", "virtual"})
-"""Whose error frames come as the kernel or its like made them; pcan, for one,
-puts codes of its own there."""
+"""Interfaces with error frames as in the kernel; others, such as pcan, have codes of
+their own."""
 
 
 class PythonCan:
@@ -103,7 +103,7 @@ class PythonCan:
         return Frame(self._clock.time_ns(message.timestamp), message.arbitration_id, flags, data)
 
     def only(self, identifiers: Collection[Identifier] | None) -> None:
-        """Nothing: what an interface's filter leaves out differs, error frames
+        """No filter: the interfaces differ in what their filters remove, error frames
         among it."""
 
     def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:

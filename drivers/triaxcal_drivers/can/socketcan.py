@@ -78,7 +78,7 @@ def read_link(name: str) -> Link:
 
 
 def link_of(reply: bytes) -> Link:
-    """Of a message RTM_NEWLINK. Raises OSError where it is an error message."""
+    """Link of a message RTM_NEWLINK. Raises OSError for an error message."""
     length, kind, *_ = _NETLINK_HEADER.unpack_from(reply)
     if kind == _NETLINK_ERROR:
         (code,) = struct.unpack_from("=i", reply, _NETLINK_HEADER.size)
@@ -140,8 +140,8 @@ than a USB adapter takes to hand a frame on."""
 _STEP_NS = 1_000_000_000
 """No adapter keeps a frame so long: one of the two clocks was set."""
 _LEARNT_NS = 10_000_000
-"""By no more do the delays of an adapter differ; a greater way back is the host
-clock's."""
+"""Largest variation of an adapter's delay; a larger step back is one of the host's
+clock."""
 
 
 class HardwareClock:
@@ -161,7 +161,7 @@ class HardwareClock:
         self._last_ns = 0
 
     def time_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """Of the host, of one frame; frames in order."""
+        """Host time of one frame; frames in order."""
         apart = kernel_ns - hardware_ns
         if self._least is None or not -_STEP_NS < apart - self._least < _STEP_NS:
             self._least = self._least_now = apart
@@ -232,8 +232,8 @@ def bytes_of(identifier: int, data: bytes, *, extended: bool, fd: bool) -> bytes
 
 
 def filters_of(identifiers: Collection[Identifier] | None) -> bytes:
-    """For CAN_RAW_FILTER: data and remote frames of these identifiers; all of
-    them where they are None, or more than the kernel takes."""
+    """CAN_RAW_FILTER for data and remote frames of these identifiers; for all frames if
+    None, or for more identifiers than the kernel accepts."""
     if identifiers is None or len(identifiers) > FILTERS_MOST:
         return _FILTER.pack(0, 0)
     return b"".join(
@@ -271,7 +271,8 @@ def unbound(name: str) -> socket.socket:
 
 
 def set_up(sock: socket.socket, settings: SocketCanOptions, *, fd: bool) -> None:
-    """Before it is bound: nothing is received otherwise than asked for."""
+    """Set the options of a socket before it is bound, so that they hold for every
+    frame."""
     raw, every = socket.SOL_CAN_RAW, socket.SOL_SOCKET
     sock.setsockopt(raw, _ERROR_FILTER, _NUMBER.pack(_ALL_ERRORS))
     sock.setsockopt(raw, _LOOPBACK, int(settings.local_loopback))
@@ -288,8 +289,8 @@ def set_up(sock: socket.socket, settings: SocketCanOptions, *, fd: bool) -> None
 
 
 def make_room(sock: socket.socket, name: str, settings: SocketCanOptions, bitrate: int) -> None:
-    """For `BUFFER_S` of a full bus, or as far as the system lets an ordinary
-    user; what was asked for by an option, exactly."""
+    """Set the receive buffer: exactly that of an option, else enough for `BUFFER_S` of
+    a full bus, as far as the system allows."""
     asked = settings.receive_buffer
     size = asked or min(round(BUFFER_S * bitrate / FRAME_BITS * FRAME_BYTES), 1 << 29)
     half = math.ceil(size / 2)  # the kernel takes twice as much as it is asked for
@@ -306,7 +307,7 @@ def make_room(sock: socket.socket, name: str, settings: SocketCanOptions, bitrat
 
 
 def reason(e: OSError, name: str) -> str:
-    """What the errors of the system mean here, and what mends them."""
+    """Meaning of a system error here, and its remedy."""
     where = f"socketcan {name}"
     code = e.errno
     if code in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
@@ -332,8 +333,8 @@ _LOST_BEFORE = int(RawFlag.LOST_BEFORE)
 
 
 class Reception:
-    """Of one socket, its frames in order. The host's time is taken for a frame
-    that comes without any."""
+    """Reception of one socket, frames in order. A frame without a time stamp gets the
+    host's time."""
 
     def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
         self._now_ns = now_ns
@@ -369,7 +370,7 @@ class Reception:
         return (count - self._told) % _COUNTED
 
     def _time_ns(self, kind: int, value: bytes) -> int:
-        """Of the stamps that only some have; 0 where it is none."""
+        """Time of an optional stamp; 0 if it is none."""
         if kind == STAMPS_OLD:
             seconds, rest = _TIME_OLD.unpack(value)
             return int(seconds * _NS + rest)
@@ -383,8 +384,8 @@ class Reception:
 AT_ONCE = 1024
 """Frames that `receive` gives at most: of a tenth of a second, of a full bus."""
 GATHER_S, GATHER_MOST_S = 0.005, 0.1
-"""What comes within this time of a frame comes with it, for fewer wake-ups; not
-while an answer is awaited. The longer the fewer come."""
+"""Time for which frames are gathered, to save wake-ups, except while an answer is
+awaited; longer at a low rate."""
 GATHER_FEW, GATHER_MANY = 32, 256  # frames: from the former on another wake-up hardly counts
 ANSWER_S = 0.1  # after something was sent
 SEND_S = 0.1  # in which a queue of ten frames, as interfaces have, gets empty even at 20 kbit/s
@@ -454,8 +455,8 @@ class SocketCan:
         return frames
 
     def _drain(self) -> list[Frame]:
-        """What waits. The kernel tells of a failure before the frames that came
-        before it, and once."""
+        """Waiting frames. The kernel reports a failure once, ahead of the frames before
+        it."""
         frames: list[Frame] = []
         receive, frame_of = self._socket.recvmsg, self._reception.frame
         while len(frames) < AT_ONCE:
@@ -608,7 +609,7 @@ def _usable_link(name: str, settings: SocketCanOptions, bitrate: int | None) -> 
 
 
 def _fault(link: Link) -> str | None:
-    """Of a link that is up, and yet gives no frames."""
+    """Message about a link that is up but gives no frames."""
     if link.state is ControllerState.BUS_OFF and not link.restart_ms:
         return (
             f"socketcan {link.name}: it is bus-off, and nothing starts it again: `ip link set {link.name} type can "

@@ -28,13 +28,13 @@ from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag
 
 OPTIONS = frozenset({"port", "hop_limit", "fd"})
-"""Of python-can's bus, those that are known here."""
+"""Known options of python-can's bus."""
 PORT = 43113  # python-can's default
 AT_ONCE = 1024  # frames that `receive` gives at most
 ANSWER_S = 0.1  # after something was sent an answer is awaited: nothing gathers
 GATHER_LEAST_S, GATHER_MOST_S = 0.002, 0.1
-"""What comes within this time of a frame comes with it: a wake-up costs as much
-as several frames."""
+"""Limits of the time for which frames are gathered: a wake-up costs as much as several
+frames."""
 GATHER_FRAMES = 32  # more at once save little, and fill the socket's buffer
 FASTEST_HZ = 8000.0  # frames of a full CAN bus of 1 Mbit/s
 BUFFER_BYTES = 1 << 24  # asked for; the kernel gives what it allows
@@ -103,7 +103,7 @@ class UdpMulticast:
         return frames
 
     def _drain(self) -> list[Frame]:
-        """What waits. Raises BusError where the first of it is none."""
+        """Waiting frames. Raises BusError if the first datagram is no frame."""
         frames: list[Frame] = []
         receive = self._socket.recvmsg
         while len(frames) < AT_ONCE:
@@ -145,7 +145,7 @@ class UdpMulticast:
         return Frame(time_ns, source, flags | _LOST if lost else flags, data, lost)
 
     def only(self, identifiers: Collection[Identifier] | None) -> None:
-        """Nothing: the group brings every frame."""
+        """No filter: the group brings every frame."""
 
     def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
         if not 0 <= identifier <= (_EXTENDED_MOST if extended else _STANDARD_MOST) or len(data) > 8:

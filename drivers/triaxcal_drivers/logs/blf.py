@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from typing import BinaryIO
 
-from triaxcal_drivers.logs.frames import (
+from triaxcal_drivers.logs.can_frames import (
     CLASSIC_MOST,
     ERROR,
     EXTENDED,

@@ -17,7 +17,7 @@ from typing import BinaryIO, cast
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.files import open_file, special_kind
 from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
-from triaxcal_drivers.logs.frames import BYTE_ORDER_MARK, Account, LoggedFrame
+from triaxcal_drivers.logs.can_frames import BYTE_ORDER_MARK, Account, LoggedFrame
 
 HEAD = 8192  # bytes by which the kind is told
 GZIP = b"\x1f\x8b"

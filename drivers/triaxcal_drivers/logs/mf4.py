@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.logs.frames import (
+from triaxcal_drivers.logs.can_frames import (
     CLASSIC_MOST,
     ERROR,
     EXTENDED,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import chain, islice
 from typing import BinaryIO, NamedTuple
 
-from triaxcal_drivers.logs.frames import (
+from triaxcal_drivers.logs.can_frames import (
     CLASSIC_MOST,
     ERROR,
     EXTENDED,

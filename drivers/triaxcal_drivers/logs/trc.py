@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from typing import BinaryIO
 
-from triaxcal_drivers.logs.frames import (
+from triaxcal_drivers.logs.can_frames import (
     CLASSIC_MOST,
     ERROR,
     EXTENDED,

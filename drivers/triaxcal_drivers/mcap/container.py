@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 
 import zstandard
 
-from triaxcal_drivers.logs.frames import Account
+from triaxcal_drivers.logs.can_frames import Account
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_MOST = 64 * 2**20

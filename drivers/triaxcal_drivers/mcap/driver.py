@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import Device, RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.logs.frames import LONGEST_NS
+from triaxcal_drivers.logs.can_frames import LONGEST_NS
 from triaxcal_drivers.mcap.messages import MessageSchema, Read, reader
 from triaxcal_drivers.profile import (
     CHANNELS_MOST,

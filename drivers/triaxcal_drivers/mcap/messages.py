@@ -22,7 +22,7 @@ from typing import Any
 
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import nearest
-from triaxcal_drivers.logs.frames import LONGEST_NS
+from triaxcal_drivers.logs.can_frames import LONGEST_NS
 
 FORMAT = "triaxcal.messages/1"
 DEFINITION_MOST = 256 * 2**10  # bytes; a sensor's message with all that it is made of has some ten thousand

@@ -17,7 +17,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from weakref import WeakKeyDictionary
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import canonical_host, canonical_port
 from triaxcal_drivers.errors import BusError, DeviceSilent
 from triaxcal_drivers.modbus.protocol import (
@@ -32,13 +31,14 @@ from triaxcal_drivers.modbus.protocol import (
     read_reply_bytes,
 )
 from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, read_request, reason_of, write_request
+from triaxcal_drivers.stall_clock import StallTolerantClock
 from triaxcal_drivers.two_senders import Answers, Extra
 
 _FOR_NOW = (b"\x05", b"\x06", b"\x0a", b"\x0b")
 """Exceptions after which the unit's own reply may still come: it is busy, or a
 gateway did not wait for it."""
 _LOOK_S = 0.01
-"""How often a unit that owes a late reply looks whether it has come, and
+"""How often a unit that owes a late reply checks whether it has come, and
 whether a line has fallen silent."""
 _QUIET_S = 0.03
 """After bytes that are no reply, an RTU line that is silent for so long brings
@@ -46,13 +46,13 @@ no more of it: twice as long as a USB adapter holds bytes back."""
 
 
 class Line:
-    """To be had by `join`. ``attention`` is what its time-outs count."""
+    """To be had by `join`. ``clock`` measures its time-outs."""
 
     def __init__(self, where: TcpAddress | SerialLine) -> None:
         self.where = where
         self.name = where.port if isinstance(where, SerialLine) else f"{where.host}:{where.port}"
         self.users = 0
-        self.attention = Attention(asyncio.get_running_loop())
+        self.clock = StallTolerantClock(asyncio.get_running_loop())
         self._frame_gap_s = where.frame_gap_s if isinstance(where, SerialLine) else 0.0
         self._opening, self._turn = asyncio.Lock(), asyncio.Lock()
         self._link: Link | None = None
@@ -94,7 +94,7 @@ class Line:
 
     async def _connected(self, address: TcpAddress, timeout_s: float) -> Link:
         try:
-            async with self.attention.timeout(timeout_s):
+            async with self.clock.timeout(timeout_s):
                 return await connect_tcp(address, self._on_frame)
         except TimeoutError as e:
             raise BusError(f"cannot connect to {self.name}: no answer in {timeout_s:g} s") from e
@@ -102,7 +102,7 @@ class Line:
             raise BusError(f"cannot connect to {self.name}: {reason_of(e)}") from e
 
     def close(self) -> None:
-        self.attention.close()
+        self.clock.close()
         if self._link is not None:
             self._link.close()
         self._on_lost()
@@ -111,13 +111,13 @@ class Line:
         """So long the late reply of a request to this unit that was given up
         may still come, which on RTU would pass for the reply to the next
         one."""
-        now_s = self.attention.now_s()
+        now_s = self.clock.now_s()
         if not self._frame_gap_s or math.isinf(now_s):  # closed: nothing is asked any more
             return 0.0
         return max(self._late_until_s.get(unit, 0.0) - now_s, 0.0)
 
     def owe(self, unit: int, seconds: float) -> None:
-        now_s = self.attention.now_s()
+        now_s = self.clock.now_s()
         if seconds > 0 and math.isfinite(now_s):
             self._late_until_s[unit] = now_s + seconds
             self._spoiled.pop(unit, None)
@@ -157,11 +157,11 @@ class Line:
             self._asked, self._request, self._other = unit, pdu, None
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
-            until_s = self.attention.now_s() + patience_s
+            until_s = self.clock.now_s() + patience_s
             self._answers.asked(self._key(unit, self._transaction))
             self._link.send(unit, self._transaction, pdu)
             try:
-                async with self.attention.timeout(patience_s):
+                async with self.clock.timeout(patience_s):
                     reply = await self._reply(self._link, expected, unit, pdu)
             except TimeoutError as e:
                 self._mute = not self._frame_gap_s  # by TCP: until another frame comes
@@ -172,7 +172,7 @@ class Line:
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
-                    self._owe_after(self._link, unit, pdu, late_s + max(until_s - self.attention.now_s(), 0.0))
+                    self._owe_after(self._link, unit, pdu, late_s + max(until_s - self.clock.now_s(), 0.0))
         return reply
 
     async def _reply(self, link: Link, expected: asyncio.Future[bytes], unit: int, pdu: bytes) -> bytes:
@@ -181,8 +181,8 @@ class Line:
         usual_s = self._latency_s.get(unit, math.inf)
         quiet_s = max(_QUIET_S, 2 * self._frame_gap_s)
         # By TCP no bytes are spoiled; a write is waited for: the unit may store.
-        watched = self._frame_gap_s and math.isfinite(usual_s) and read_reply_bytes(pdu) is not None
-        while watched and not expected.done():
+        detects_damage = self._frame_gap_s and math.isfinite(usual_s) and read_reply_bytes(pdu) is not None
+        while detects_damage and not expected.done():
             await asyncio.wait([expected], timeout=_LOOK_S)
             # Noise may come before the reply: then the unit still has its time.
             until_s = link.last_byte_s if _was_the_reply(link, pdu) else link.sent_s + 2 * usual_s
@@ -211,9 +211,9 @@ class Line:
         while True:
             while (left_s := self._owed_before_s(unit, pdu)) > 0:
                 await asyncio.sleep(min(left_s, _LOOK_S))
-            begun_s = self.attention.now_s()
+            begun_s = self.clock.now_s()
             async with self._turn:
-                if math.isfinite(waited_s := self.attention.now_s() - begun_s):
+                if math.isfinite(waited_s := self.clock.now_s() - begun_s):
                     self._waited_s[unit] = self._waited_s.get(unit, 0.0) + waited_s
                 if self._owed_before_s(unit, pdu) == 0:
                     yield
@@ -307,7 +307,7 @@ def leave(line: Line) -> None:
     """Closes the line once nobody uses it any more."""
     line.users -= 1
     if line.users == 0:
-        lines = _lines.get(line.attention.loop, {})
+        lines = _lines.get(line.clock.loop, {})
         # By identity: the port behind a link may be another one by now.
         for key in [key for key, known in lines.items() if known is line]:
             del lines[key]
@@ -347,15 +347,15 @@ class ModbusClient:
 
     @property
     def attention_s(self) -> float:
-        """Time [s] that goes on while this process looks at the line."""
-        return self._line.attention.now_s()
+        """Time [s] of the line's stall-tolerant clock."""
+        return self._line.clock.now_s()
 
     @property
     def own_s(self) -> float:
         """Time [s] that goes on while this unit has the line or could have it:
-        the line's attention, less what other units took while a request of this
+        the line's clock, less what other units took while a request of this
         one waited."""
-        return self._line.attention.now_s() - self._line.waited_s(self._unit_id)
+        return self._line.clock.now_s() - self._line.waited_s(self._unit_id)
 
     @property
     def alone(self) -> bool:

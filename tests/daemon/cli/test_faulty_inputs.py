@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from triaxcal.model.directions import directions
-from triaxcald.recording.frames import MAGIC
+from triaxcald.recording.mcap_records import MAGIC
 
 Run = Callable[..., Any]
 HEADER = "t_s,ux,uy,uz\n"

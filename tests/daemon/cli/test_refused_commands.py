@@ -17,7 +17,7 @@ import pytest
 from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
 from triaxcald.provision.state import Held
-from triaxcald.run.line import Outcome
+from triaxcald.run.unit_run import Outcome
 from triaxcald.simulation.unit import Stored, factory_calibration
 from triaxcald.verification import Verification
 

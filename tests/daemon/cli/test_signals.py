@@ -163,8 +163,8 @@ run_interruptible(deaf())
 
 def test_a_third_signal_while_a_device_is_written_to_is_4_and_says_so() -> None:
     code = """
-from triaxcald.abort import Left, at_abort
-with at_abort(lambda _: Left("NOT restored: half is written", in_doubt=True)):
+from triaxcald.abort import AbortNotice, at_abort
+with at_abort(lambda _: AbortNotice("NOT restored: half is written", in_doubt=True)):
     run_interruptible(deaf())
 """
     done = _python(DEAF + code)

@@ -6,7 +6,7 @@ import pytest
 
 from triaxcal_drivers.can.layout import Layout, Message, Signal
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.frames import LoggedFrame
+from triaxcal_drivers.logs.can_frames import LoggedFrame
 from triaxcald.errors import InputError
 from triaxcald.imports.of_can import Selection
 

@@ -16,7 +16,7 @@ from triaxcal_drivers.registers import ByteOrder
 from triaxcald.audit.differences import Difference
 from triaxcald.audit.traffic import Said, Traffic, check
 from triaxcald.outcome import registers_told
-from triaxcald.provision.access import Pace, RegisterAccess, RegisterLink
+from triaxcald.provision.access import Clock, RegisterAccess, RegisterLink
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import build_image
 from triaxcald.provision.state import Held
@@ -175,8 +175,8 @@ class MemoryDevice:
         self.log.clear()
 
     @property
-    def pace(self) -> Pace:
-        return Pace(self.sleep, lambda: self.now_s)
+    def clock(self) -> Clock:
+        return Clock(self.sleep, lambda: self.now_s)
 
     @property
     def written(self) -> list[str]:
@@ -212,7 +212,7 @@ class Bench:
 
     def connected(self) -> RegisterLink:
         """As a process that has just begun finds the device."""
-        return RegisterLink(self.device, self.profile, self.records.append, pace=self.device.pace)
+        return RegisterLink(self.device, self.profile, self.records.append, clock=self.device.clock)
 
     def _calibration(self, values: dict[str, float], date_days: int) -> dict[str, bytes]:
         raw = build_image(self.profile, values, date_days=date_days).raw

@@ -19,7 +19,7 @@ from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSi
 from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.two_senders import ExtraAnswer
 from triaxcald.errors import DaemonError
-from triaxcald.provision.access import Pace, RegisterLink
+from triaxcald.provision.access import Clock, RegisterLink
 from triaxcald.provision.journal import journaled_image, parse
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage, Snapshot, image_of
@@ -84,7 +84,7 @@ class Host:
         self.requests = 0
         in_memory = InMemoryDevice(self.place, ERRORS, self.clock, extra=ExtraAnswer)
         device = _Mortal(self, in_memory, kill_at, kill_after)
-        self._link = RegisterLink(device, self.bundle.profile, pace=Pace(self.clock.sleep, self.clock.now))
+        self._link = RegisterLink(device, self.bundle.profile, clock=Clock(self.clock.sleep, self.clock.now))
         try:
             with suppress(Killed):
                 await device.open()

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from triaxcal_drivers.errors import DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
 from triaxcal_drivers.two_senders import ExtraAnswer
-from triaxcald.provision.access import Pace
+from triaxcald.provision.access import Clock
 
 Fault = Literal[
     "lost", "duplicated", "late", "torn", "reverted on lock", "ignored", "forgotten", "second unit answers", "flipped"
@@ -154,7 +154,7 @@ class Unit:
             raise Silent
         if "forgotten" not in self.habits:
             self.eeprom = dict(self.ram)
-        if fault == "flipped":  # the bit by which the first mark differs
+        if fault == "flipped":  # the bit by which the first probe differs
             self.eeprom["bias_x"] = bytes([self.ram["bias_x"][0], self.ram["bias_x"][1] ^ 1])
 
 
@@ -182,8 +182,8 @@ class ModelDevice:
         self._extra.clear()
 
     @property
-    def pace(self) -> Pace:
-        return Pace(self._sleep, lambda: self.now_s)
+    def clock(self) -> Clock:
+        return Clock(self._sleep, lambda: self.now_s)
 
     async def _sleep(self, seconds: float) -> None:
         self.now_s += max(seconds, 0.0)

@@ -47,7 +47,7 @@ class Run:
 
 def provisioning(device: ModelDevice, folder: Path, wanted: Mapping[str, bytes]) -> Provisioning:
     bundle = BUNDLES[device.kind]
-    link = RegisterLink(device, bundle.profile, pace=device.pace)
+    link = RegisterLink(device, bundle.profile, clock=device.clock)
     image = image_of(bundle.profile, wanted)
     return Provisioning(link, bundle, image, unit="u", folder=folder, expected_serial="0777", where="here", run="1")
 
@@ -193,7 +193,7 @@ async def test_a_clean_run_ends_as_the_device_allows(folder: Path) -> None:
         (Kind(store=False), ("forgotten", "ignored"), (1, 1), DeviceState.NEW_UNVERIFIED, None),
         # Its supply dips in the store, after its counter has advanced.
         (Kind(reset=False), ("torn",), (0,), DeviceState.OLD, OLD),
-        # Its store flips just the bit by which a mark differs.
+        # Its store flips just the bit by which a probe differs.
         (Kind(), ("flipped",), (0,), DeviceState.OLD, OLD),
         # A second unit answers from the second request on, and from the last look before the store on.
         (Kind(), ("second unit answers",), (1,), DeviceState.UNTOUCHED, OLD),

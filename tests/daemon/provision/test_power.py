@@ -13,7 +13,7 @@ from tests.devices.in_memory import VirtualClock
 from tests.devices.profiles import profile_text
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import DeviceBusy, DeviceSilent, RegisterRefused
-from triaxcald.provision.access import Pace
+from triaxcald.provision.access import Clock
 from triaxcald.provision.power import least_off_s, power_cycled
 
 PROFILE = parse_bundle(profile_text("modbus", Habits()).encode(), {}, where="a profile").profile
@@ -24,7 +24,7 @@ class Link:
 
     def __init__(self, answers: Callable[[float], Exception | None]) -> None:
         self._clock, self._answers = VirtualClock(), answers
-        self.pace = Pace(self._clock.sleep, self._clock.now)
+        self.clock = Clock(self._clock.sleep, self._clock.now)
 
     async def read_once(self, _: str) -> bytes:
         failure = self._answers(self._clock.now())

@@ -24,10 +24,10 @@ async def test_a_calibration_is_in_use_and_stored_after_provisioning(make_bench,
 
 async def test_the_checksum_is_written_last(bench) -> None:
     await bench.provision()
-    *written, mark = bench.device.written
+    *written, probe = bench.device.written
     assert written[-1] == "calibration_crc"
     assert written.count("calibration_crc") == 1
-    assert mark == "scale_factor_x", "off by a bit, and gone with the restart"
+    assert probe == "scale_factor_x", "off by a bit, and gone with the restart"
 
 
 def with_one_bias_changed(bench) -> RegisterImage:
@@ -83,11 +83,11 @@ async def test_every_access_is_recorded_with_its_bytes(bench) -> None:
     await bench.provision()
     done = [(a.kind, a.register) for a in bench.records]
     assert done == [entry for entry in bench.device.log if entry[0] != "open"]
-    *written, (marked, mark) = [
+    *written, (probed, probe) = [
         (a.register, a.raw) for a in bench.records if a.kind == "write" and a.register in CALIBRATION
     ]
     assert dict(written) == {name: bench.image.raw[name] for name in bench.device.written}
-    assert mark not in (bench.image.raw[marked], bench.old[marked])
+    assert probe not in (bench.image.raw[probed], bench.old[probed])
 
 
 async def test_a_refused_access_is_recorded_with_its_error(make_bench) -> None:

@@ -130,7 +130,7 @@ async def test_a_value_that_was_put_in_to_show_a_restart_does_not_stay(bench) ->
             raise DeviceSilent("no reply")
         if request == ("write", "scale_factor_x"):
             puts.append(request[1])
-            if len(puts) == 4:  # the new value, a mark for each attempt, the new value again
+            if len(puts) == 4:  # the new value, a probe for each attempt, the new value again
                 raise RegisterRefused("locked", register=request[1], code=1)
 
     bench.device.trouble = deaf_to_resets

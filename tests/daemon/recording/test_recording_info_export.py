@@ -16,7 +16,7 @@ from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.tables.own_text import read_csv
+from triaxcald.tables.native_csv import read_csv
 
 T0_NS = 1_700_000_000_000_000_000
 

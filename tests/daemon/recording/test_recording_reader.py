@@ -11,7 +11,7 @@ from mcap.writer import Writer as McapWriter
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import contents, reader, schema
-from triaxcald.recording.frames import MAGIC, Frame
+from triaxcald.recording.mcap_records import MAGIC, UnparsedRecord
 from triaxcald.recording.raw_batch import Fields
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -53,9 +53,9 @@ def test_messages_of_one_topic_are_those_among_all_and_chunks_known_to_have_none
     unpacked: list[int] = []
     unpack = reader.chunk_data
 
-    def counted(frame: Frame, name: str) -> bytes:
-        unpacked.append(frame.offset)
-        return unpack(frame, name)
+    def counted(unparsed: UnparsedRecord, name: str) -> bytes:
+        unpacked.append(unparsed.offset)
+        return unpack(unparsed, name)
 
     monkeypatch.setattr(reader, "chunk_data", counted)
     with Recording.open(recording) as rec:

@@ -26,8 +26,8 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import BUS_RECORD
 from triaxcald.run import recording as recording_module
 from triaxcald.run.recording import BusRecording, State
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station
+from triaxcald.station.reconnect import RetryPolicy
 
 Row = tuple[int, int, int, bytes]
 FOREIGN = [
@@ -92,9 +92,9 @@ def beside(workshop: Any, request: pytest.FixtureRequest) -> tuple[Path, Path]:
         units = {"bus": where, "profile": "triax-ref-can"}
         station = load_station(workshop.station(units, buses=[{"name": "bus", "bus": bus}]))
         recording = listening(station, told, paths[0])
-        heard = asyncio.ensure_future(recording.run(None, Patience()))
+        heard = asyncio.ensure_future(recording.run(None, RetryPolicy()))
         await told.until("bus", lambda text: text == "recording")
-        unit = recorded(station, workshop.folder, told, seconds=1.0, patience=Patience())
+        unit = recorded(station, workshop.folder, told, seconds=1.0, policy=RetryPolicy())
         await told.until("unit0", lambda text: text == "recording")
         with can.Bus(channel, "virtual", ignore_config=True) as other:
             for message in FOREIGN:
@@ -198,7 +198,7 @@ async def test_a_bus_that_vanishes_comes_back_in_one_recording_with_the_gap(work
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, path, dongle = Told(), workshop.folder / "bus.mcap", Dongle(port)
     recording = listening(station, told, path)
-    work = asyncio.ensure_future(recording.run(None, Patience()))
+    work = asyncio.ensure_future(recording.run(None, RetryPolicy()))
     await told.until("dongle", lambda text: text == "recording")
     told_it = dongle.was_told()
     assert ("L" in told_it, "O" in told_it, "S6" in told_it) == (True, False, True), "opened to listen only"
@@ -234,7 +234,7 @@ async def test_a_bus_that_does_not_come_back_is_given_up_and_the_recording_says_
     bus = {"interface": "slcan", "channel": str(port)}
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, path, dongle = Told(), workshop.folder / "bus.mcap", Dongle(port)
-    work = asyncio.ensure_future(listening(station, told, path).run(None, Patience(most_s=0.0)))
+    work = asyncio.ensure_future(listening(station, told, path).run(None, RetryPolicy(most_s=0.0)))
     await told.until("dongle", lambda text: text == "recording")
     dongle.unplug()
     kept = await work
@@ -254,7 +254,7 @@ async def test_a_folder_that_is_removed_ends_the_recording_of_a_bus_that_brings_
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, folder, dongle = Told(), workshop.folder / "recordings", Dongle(port)
     folder.mkdir()
-    work = asyncio.ensure_future(listening(station, told, folder / "bus.mcap").run(None, Patience()))
+    work = asyncio.ensure_future(listening(station, told, folder / "bus.mcap").run(None, RetryPolicy()))
     await told.until("dongle", lambda text: text == "recording")
     if lost:
         dongle.unplug()
@@ -277,7 +277,7 @@ async def test_whoever_waits_for_a_bus_without_end_is_told_how_to_set_one(
     )
     told = Told()
     work = asyncio.ensure_future(
-        listening(station, told, workshop.folder / "bus.mcap").run(None, Patience(most_s=most_s))
+        listening(station, told, workshop.folder / "bus.mcap").run(None, RetryPolicy(most_s=most_s))
     )
     await told.until("dongle", lambda text: text.startswith("lost: "))
     work.cancel()
@@ -289,7 +289,7 @@ async def test_a_bus_that_is_not_there_is_given_up(workshop: Any, port: Path) ->
     bus = {"interface": "slcan", "channel": str(port)}
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, path = Told(), workshop.folder / "bus.mcap"
-    kept = await listening(station, told, path).run(None, Patience(most_s=0.0))
+    kept = await listening(station, told, path).run(None, RetryPolicy(most_s=0.0))
     assert (kept.exit_code, kept.path) == (4, None)
     assert kept.error is not None
     assert kept.error.startswith(f"bus dongle: cannot open slcan {port}: ")

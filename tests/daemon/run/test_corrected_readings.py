@@ -19,7 +19,7 @@ from tests.devices.profiles import Wording, profile_text, station_text
 from tests.devices.table import Coefficients
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
-from triaxcald.provision.access import Pace, RegisterLink
+from triaxcald.provision.access import Clock, RegisterLink
 from triaxcald.run import session, write_back
 from triaxcald.station import collection
 from triaxcald.station.config import Place
@@ -93,10 +93,12 @@ class Line:
 def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Line]:
     def make(habits: Habits | None = None, *, before: Coefficients = NEUTRAL, corrects_all: bool = True) -> Line:
         made = Line(tmp_path, habits or Habits(), before=before, corrects_all=corrects_all)
-        pace = Pace(made.clock.sleep, made.clock.now)
+        clock = Clock(made.clock.sleep, made.clock.now)
         monkeypatch.setattr(Place, "device", lambda _: made.device())
         for module in (session, write_back):
-            monkeypatch.setattr(module, "RegisterLink", lambda *given, **more: RegisterLink(*given, **more, pace=pace))
+            monkeypatch.setattr(
+                module, "RegisterLink", lambda *given, **more: RegisterLink(*given, **more, clock=clock)
+            )
         for name, value in (("LOOK_SAMPLES_S", 2.0), ("LOOK_HOST_S", 0.0), ("LOOK_SHARE", 0.0)):
             monkeypatch.setattr(collection, name, value)
         return made

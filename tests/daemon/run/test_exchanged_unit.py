@@ -24,10 +24,10 @@ from triaxcald.audit import audit
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
-from triaxcald.run.line import run_station
+from triaxcald.run.unit_run import run_station
 from triaxcald.station import output_check as confirmation
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
+from triaxcald.station.reconnect import RetryPolicy
 
 OURS_V, THEIRS_V = -2.4, -2.1
 OTHER_SERIAL = 888
@@ -292,7 +292,7 @@ async def test_a_stop_asks_once_more_and_says_which_unit_was_exchanged(workshop:
         ]
         places = [{"bus": one.bus, "profile": "triax-ref-modbus"} for one in served]
         station = load_station(workshop.station(*places))
-        work = recorded(station, workshop.folder, told, seconds=None, patience=Patience())
+        work = recorded(station, workshop.folder, told, seconds=None, policy=RetryPolicy())
         for name in ("unit0", "unit1"):
             await told.until(name, lambda text: text == "recording")
         await asyncio.sleep(1.0)

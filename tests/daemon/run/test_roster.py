@@ -12,9 +12,9 @@ import pytest
 from triaxcald.errors import DISK, INTERRUPTED, DiskError, RecordingError
 from triaxcald.recording.schema import Phase
 from triaxcald.run.recording import AtRecording, Kept, Roster, State
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.guidance import Guide
 from triaxcald.station.listening import RawRecords
+from triaxcald.station.reconnect import RetryPolicy
 from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP, nothing_deleted
 
 
@@ -52,7 +52,7 @@ class Played(AtRecording):
     def _seconds(self) -> float:
         return 0.0
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         self._state = State.RECORDING
         await self.ends.wait()
         if self.fault is not None:
@@ -83,7 +83,7 @@ class Written(Played):
 
     writer: Any
 
-    async def _work(self, seconds: float | None, patience: Patience) -> None:
+    async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         async def record(_: object) -> None:
             await self.ends.wait()
 
@@ -103,7 +103,7 @@ def told() -> list[Kept]:
 
 @pytest.fixture
 def roster(told: list[Kept]) -> Roster:
-    return Roster(None, Patience(), told.append)
+    return Roster(None, RetryPolicy(), told.append)
 
 
 def states(roster: Roster) -> dict[str, State]:
@@ -164,7 +164,7 @@ async def test_what_was_wrong_with_the_manifest_is_shown(tmp_path: Path) -> None
     one = Written("a")
     one.writer = Writer(tmp_path / "a-000002.mcap")
     one.writer.warning = "a.segments.json: not JSON"
-    work = asyncio.ensure_future(one.run(None, Patience()))
+    work = asyncio.ensure_future(one.run(None, RetryPolicy()))
     await until(lambda: one.shown.lines == ["warning: a.segments.json: not JSON"])
     one.ends.set()
     await work
@@ -176,7 +176,7 @@ async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
     monkeypatch.setattr("triaxcald.run.recording.LOOK_S", 0.001)
     one = Written("a")
     one.writer = Writer(tmp_path / "a-000002.mcap")
-    work = asyncio.ensure_future(one.run(None, Patience()))
+    work = asyncio.ensure_future(one.run(None, RetryPolicy()))
     await until(lambda: one.status.state is State.RECORDING)
     one.writer.is_behind = True
     assert (one.status.state, one.status.trouble) == (State.WAITING, DISK_IS_BEHIND)

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.catalogue import BUILT_IN
-from triaxcald.cli.line import _document, show_outcome, worst
+from triaxcald.cli.stations import _document, show_outcome, worst
 from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run import line as station_line
-from triaxcald.run.line import Outcome, UnitRun, run_station
+from triaxcald.run import unit_run
+from triaxcald.run.unit_run import Outcome, UnitRun, run_station
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
 from triaxcald.station.config import load_station
@@ -110,7 +110,7 @@ async def test_an_internal_error_is_an_outcome_even_where_nobody_can_be_told(
 def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_is_in(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    attach, close, write_text = RecordingWriter.attach, RecordingWriter.close, station_line.write_text
+    attach, close, write_text = RecordingWriter.attach, RecordingWriter.close, unit_run.write_text
 
     def full_attach(self: RecordingWriter, name: str, *more: Any) -> None:
         if name == "report.html":
@@ -131,7 +131,7 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
     elif where == "closing":
         monkeypatch.setattr(RecordingWriter, "close", full_close)
     else:
-        monkeypatch.setattr(station_line, "write_text", full_write_text)
+        monkeypatch.setattr(unit_run, "write_text", full_write_text)
     with workshop.serve(workshop.device(**QUICK)) as served:
         done = triaxcal("run", workshop.station({"bus": served.bus}, plan=PLAN), "--json")
         assert served.unit.eeprom != OLD.image()
@@ -202,14 +202,14 @@ async def test_a_device_without_a_corrected_stream_is_written_and_said_to_be_unv
 def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    report = station_line.unit_report
+    report = unit_run.unit_report
 
     def broken(certified: Any, *more: Any) -> str:
         if certified.document["unit"]["serial"] == "4712":
             raise ValueError("a fault of the program")
         return report(certified, *more)
 
-    monkeypatch.setattr(station_line, "unit_report", broken)
+    monkeypatch.setattr(unit_run, "unit_report", broken)
     good, bad = workshop.device("good.toml", **QUICK), workshop.device("bad.toml", serial=4712, **QUICK)
     with workshop.serve(good) as first, workshop.serve(bad) as second:
         station = workshop.station({"name": "good", "bus": first.bus}, {"name": "bad", "bus": second.bus}, plan=PLAN)

@@ -20,9 +20,9 @@ from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import Kept, Roster, State, UnitRecording
 from triaxcald.run.session import UnitSession
 from triaxcald.simulation.bench import load_device, simulate
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station
 from triaxcald.station.lock import locked
+from triaxcald.station.reconnect import RetryPolicy
 
 
 class Told:
@@ -68,12 +68,12 @@ class Bench:
         await self.serving.pop(i).__aexit__(None, None, None)
 
 
-def recorded(station: Station, folder: Path, told: Told, *, seconds: float | None, patience: Patience) -> Any:
+def recorded(station: Station, folder: Path, told: Told, *, seconds: float | None, policy: RetryPolicy) -> Any:
     recordings = []
     for place in station.places:
         session = UnitSession(station, place, told)
         recordings.append(UnitRecording(session, lambda _, name=session.name: folder / f"{name}.mcap"))
-    roster = Roster(seconds, patience)
+    roster = Roster(seconds, policy)
     roster.begin(recordings)
     return asyncio.ensure_future(roster.finish())
 
@@ -94,7 +94,7 @@ MODBUS = {"profile": "triax-ref-modbus", "serial": 4711}
 async def test_whoever_waits_for_a_unit_without_end_is_told_how_to_set_one(workshop: Any, most_s: float | None) -> None:
     station = load_station(workshop.station({"name": "u", "bus": {"host": "127.0.0.1", "port": 1}}))
     told = Told()
-    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=most_s))
+    work = recorded(station, workshop.folder, told, seconds=None, policy=RetryPolicy(most_s=most_s))
     await told.until("u", lambda text: text.startswith("lost: "))
     work.cancel()
     with suppress(asyncio.CancelledError):
@@ -114,7 +114,7 @@ async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
     where = await bench.put(0)
     profile = workshop.impatient_profile(str(device["profile"]))
     station = load_station(workshop.station({"bus": where, "profile": profile}))
-    work = recorded(station, workshop.folder, told, seconds=3.0, patience=Patience())
+    work = recorded(station, workshop.folder, told, seconds=3.0, policy=RetryPolicy())
     await told.until("unit0", lambda text: text == "recording")
     await asyncio.sleep(0.7)
     await bench.take(0)
@@ -149,7 +149,7 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
         seen.append((status.state, status.trouble, status.counts["samples"]))
         return status.state is State.RECORDING
 
-    work = asyncio.ensure_future(recording.run(None, Patience()))
+    work = asyncio.ensure_future(recording.run(None, RetryPolicy()))
     while not look():
         await asyncio.sleep(0.001)
     work.cancel()
@@ -164,10 +164,10 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
 async def test_a_unit_that_another_process_works_with_is_waited_for(workshop: Any, given_up: bool) -> None:
     bench, told = Bench(workshop, [MODBUS]), Told()
     station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
-    patience = Patience(most_s=0.0 if given_up else None, in_use=True)
+    policy = RetryPolicy(most_s=0.0 if given_up else None, in_use=True)
     claim = claim_of(station.places[0].bus)
     with another_process(device=claim.device, host=claim.host):
-        work = recorded(station, workshop.folder, told, seconds=0.2, patience=patience)
+        work = recorded(station, workshop.folder, told, seconds=0.2, policy=policy)
         if given_up:
             await work
         else:
@@ -183,7 +183,7 @@ async def test_a_unit_that_this_process_works_with_already_is_not_waited_for(wor
     bench, told = Bench(workshop, [MODBUS]), Told()
     station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
     async with locked(claim_of(station.places[0].bus)):
-        work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(in_use=True))
+        work = recorded(station, workshop.folder, told, seconds=None, policy=RetryPolicy(in_use=True))
         (kept,) = await work
     await bench.take(0)
     assert kept.exit_code == 4
@@ -196,7 +196,7 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     bench, told = Bench(workshop, [MODBUS]), Told()
     where = await bench.put(0)
     station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
-    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=3.0))
+    work = recorded(station, workshop.folder, told, seconds=None, policy=RetryPolicy(most_s=3.0))
     await told.until("unit0", lambda text: text == "recording")
     while not (workshop.folder / "unit0.mcap").stat().st_size > 20_000:
         await asyncio.sleep(0.01)
@@ -228,7 +228,7 @@ async def test_a_unit_that_is_not_there_keeps_nobody_waiting_and_is_recorded_onc
         {"bus": can["bus"], "profile": workshop.impatient_profile("triax-ref-can")},
     )
     station = load_station(workshop.station(*units))
-    work = recorded(station, workshop.folder, told, seconds=1.0, patience=Patience())
+    work = recorded(station, workshop.folder, told, seconds=1.0, policy=RetryPolicy())
     await told.until("unit1", lambda text: text.startswith("lost: nothing answers at node 9"))
     await told.until("unit0", lambda text: text == "recording")
     await bench.put(1)
@@ -242,7 +242,7 @@ async def test_a_recording_that_is_cancelled_is_whole_and_says_so(workshop: Any)
     bench, told = Bench(workshop, [MODBUS]), Told()
     where = await bench.put(0)
     station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
-    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience())
+    work = recorded(station, workshop.folder, told, seconds=None, policy=RetryPolicy())
     await told.until("unit0", lambda text: text == "recording")
     await asyncio.sleep(0.3)
     work.cancel()

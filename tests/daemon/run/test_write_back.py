@@ -16,12 +16,12 @@ from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
 from triaxcald.errors import DiskError, ProvisionError, RecordingError, StationError
-from triaxcald.inputs import CALIBRATION as TUMBLE
+from triaxcald.inputs import CALIBRATION as CALIBRATION_POSES
 from triaxcald.provision.procedure import restore
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.line import UnitRun
+from triaxcald.run.unit_run import UnitRun
 from triaxcald.run.write_back import WriteBack
 from triaxcald.simulation.unit import CALIBRATION, TABLE, Faults, Stored, factory_calibration
 from triaxcald.station.collection import Collection
@@ -81,8 +81,8 @@ class Bench:
         return WriteBack(self.place, self.station, self.writer, collect, ask=self.asked.append, started="today")
 
     async def run(self, back: WriteBack) -> None:
-        tumble = Collection(TUMBLE, self.place.bundle, self.place.address)
-        await back.write(await back.examine(self.device, self.image, "4711", tumble), tumble)
+        acquisition = Collection(CALIBRATION_POSES, self.place.bundle, self.place.address)
+        await back.write(await back.examine(self.device, self.image, "4711", acquisition), acquisition)
 
 
 def _state(back: WriteBack) -> DeviceState:

@@ -15,8 +15,8 @@ from triaxcal_drivers.errors import BusError, DeviceBusy, DeviceRestarted, Devic
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import StationError, TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
-from triaxcald.station.coming_back import Patience, Returning
 from triaxcald.station.output_check import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
+from triaxcald.station.reconnect import ReconnectingDevice, RetryPolicy
 
 BLANK = BlankIdentity("the unit on node 5 is serial 0000, expected 0777")
 OTHER = WrongUnit("the unit on node 5 is serial 0888, expected 0777")
@@ -75,11 +75,11 @@ class Unit:
     def unconfirmed(self, first: int, detail: Any) -> None:
         self.marked.append((first, detail["error"]))
 
-    def mark(self) -> int:
+    def checkpoint(self) -> int:
         return self.offered
 
-    def back_to(self, mark: int) -> None:
-        self.back.append(mark)
+    def roll_back(self, checkpoint: int) -> None:
+        self.back.append(checkpoint)
 
     def confirmation(self, *, asks: bool = True) -> Confirmation:
         return Confirmation(
@@ -227,18 +227,18 @@ class Returned:
     def unconfirmed(self, first: int, _: Any) -> None:
         self.marked.append(first)
 
-    def mark(self) -> int:
+    def checkpoint(self) -> int:
         return self.offered
 
-    def back_to(self, mark: int) -> None: ...
+    def roll_back(self, checkpoint: int) -> None: ...
 
     async def record(self, trouble: Exception) -> int:
         self.trouble = trouble
         confirmation = Confirmation(None, cast(Any, self), self)
-        returning = Returning(
-            cast(Any, self), lambda: confirmation.returned(self.identify), Patience(most_s=60.0), self.told.append
+        reconnecting = ReconnectingDevice(
+            cast(Any, self), lambda: confirmation.returned(self.identify), RetryPolicy(most_s=60.0), self.told.append
         )
-        async with confirmation.phase(), aclosing(returning.stream(["readings"])) as stream:
+        async with confirmation.phase(), aclosing(reconnecting.stream(["readings"])) as stream:
             async for batch in stream:
                 self.offered += len(batch)
                 if len(batch) and self.offered == self.confirmed:

@@ -17,8 +17,8 @@ from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 from triaxcald.recording.bus import describe_bus, phase_of
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import FIRST_PAUSE_S, Patience
-from triaxcald.station.listening import IDENTIFIERS_MOST, SLEPT, Listened, ReturningBus
+from triaxcald.station.listening import IDENTIFIERS_MOST, SLEPT, Listened, ReconnectingBus
+from triaxcald.station.reconnect import FIRST_PAUSE_S, RetryPolicy
 
 BEGUN_NS = 1_700_000_000_000_000_000
 LOOK_S = 0.2
@@ -63,11 +63,13 @@ class Played:
                 await asyncio.sleep(LOOK_S)
             yield RawBatch.of([(BEGUN_NS + t * 10**9, 0x185, 0, b"") for t in step])
 
-    def returning(self, patience: Patience) -> ReturningBus:
-        return ReturningBus(cast(Any, self), patience, self.told.append, now_ns=now_ns, slept_ns=lambda: self.asleep_ns)
+    def reconnecting(self, policy: RetryPolicy) -> ReconnectingBus:
+        return ReconnectingBus(
+            cast(Any, self), policy, self.told.append, now_ns=now_ns, slept_ns=lambda: self.asleep_ns
+        )
 
-    async def all(self, patience: Patience | None = None) -> list[RawBatch]:
-        async with aclosing(self.returning(patience or Patience()).stream()) as stream:
+    async def all(self, policy: RetryPolicy | None = None) -> list[RawBatch]:
+        async with aclosing(self.reconnecting(policy or RetryPolicy()).stream()) as stream:
             return [batch async for batch in stream if len(batch) or batch.gap]
 
 
@@ -123,7 +125,7 @@ def test_a_bus_that_does_not_come_back_is_given_up() -> None:
     trouble = BusError("unplugged")
     bus = Played([[[0], trouble]], [trouble] * 9)
     with pytest.raises(BusError, match="unplugged"):
-        run(bus.all(Patience(most_s=3.0)))
+        run(bus.all(RetryPolicy(most_s=3.0)))
     assert bus.opened_s[-1] <= 3.0
 
 
@@ -132,7 +134,7 @@ def test_a_machine_that_slept_heard_nothing_meanwhile() -> None:
 
     async def slept() -> list[RawBatch]:
         batches = []
-        async with aclosing(bus.returning(Patience()).stream()) as stream:
+        async with aclosing(bus.reconnecting(RetryPolicy()).stream()) as stream:
             async for batch in stream:
                 batches += [batch] if len(batch) or batch.gap else []
                 if len(batches) == 1 and bus.asleep_ns == 0:
@@ -187,6 +189,6 @@ def test_so_many_seconds_are_the_clock_s_whatever_comes(tmp_path: Path, lost: bo
     bus = Played([[[0], trouble] if lost else [[0], *quiet]], [trouble] * 99)
     listened = Listened(phase_of("can0"))
     with RecordingWriter(tmp_path / "bus.mcap", metadata={"bus": {}}, preview_channels=None) as writer:
-        run(listened.for_seconds(bus.returning(Patience()), writer, 20.0))
+        run(listened.for_seconds(bus.reconnecting(RetryPolicy()), writer, 20.0))
     assert listened.seconds == pytest.approx(20.0)
     assert listened.frames == 1

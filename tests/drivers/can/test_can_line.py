@@ -110,7 +110,7 @@ async def test_a_bus_on_which_nobody_is_heard_is_opened_anew_with_the_next_unit(
     first = unit(1)
     coming = await streaming(first)
     line = await join(settings(1))
-    monkeypatch.setattr(line, "_heard_s", line.attention.now_s() - MUTE_S)
+    monkeypatch.setattr(line, "_heard_s", line.clock.now_s() - MUTE_S)
     await leave(line)
     await (second := unit(2)).open()
     assert [adapter.closed for adapter in opened] == [True, False]

@@ -181,7 +181,7 @@ async def test_a_bus_that_fails_is_not_gone_on_with_when_somebody_else_has_opene
 
 
 def is_mute(line: CanLine, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line, "_heard_s", line.attention.now_s() - MUTE_S)
+    monkeypatch.setattr(line, "_heard_s", line.clock.now_s() - MUTE_S)
 
 
 async def test_a_bus_that_a_unit_has_opened_anew_has_a_gap(

@@ -5,11 +5,11 @@ import threading
 
 import pytest
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.line import BATCH_FRAMES, CONTROLLER_OVERFLOW, OVERFLOW, OVERRUN, FrameQueue
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawFlag
+from triaxcal_drivers.stall_clock import StallTolerantClock
 
 WANTED = {(0x185, False)}
 
@@ -22,7 +22,7 @@ def frame(number: int = 0, identifier: int = 0x185, flags: int = 0, lost: int = 
 
 
 async def opened(capacity: int = 1000) -> FrameQueue:
-    frames = FrameQueue(Attention(asyncio.get_running_loop()), capacity=capacity)
+    frames = FrameQueue(StallTolerantClock(asyncio.get_running_loop()), capacity=capacity)
     frames.open(WANTED)
     return frames
 
@@ -48,7 +48,7 @@ async def test_only_the_streams_identifiers_and_error_frames_are_taken() -> None
 
 
 async def test_nothing_is_taken_while_no_stream_is_open() -> None:
-    frames = FrameQueue(Attention(asyncio.get_running_loop()))
+    frames = FrameQueue(StallTolerantClock(asyncio.get_running_loop()))
     frames.put([frame()])
     opened = frames.open(WANTED)
     frames.put([frame(1)])
@@ -60,7 +60,7 @@ async def test_nothing_is_taken_while_no_stream_is_open() -> None:
 
 
 async def test_closing_a_stream_does_not_touch_the_one_opened_after_it() -> None:
-    frames = FrameQueue(Attention(asyncio.get_running_loop()))
+    frames = FrameQueue(StallTolerantClock(asyncio.get_running_loop()))
     earlier = frames.open(WANTED)
     frames.put([frame(1)])
     frames.open(WANTED)
@@ -185,7 +185,7 @@ async def test_no_cancellation_is_lost_that_comes_with_a_frame(turns: int) -> No
 
 async def test_a_frame_that_comes_when_the_event_loop_has_ended_is_nobodys() -> None:
     loop = asyncio.new_event_loop()
-    frames = FrameQueue(Attention(loop))
+    frames = FrameQueue(StallTolerantClock(loop))
     frames.open(WANTED)
     loop.close()
     frames.put([frame()])

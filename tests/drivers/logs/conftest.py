@@ -11,7 +11,7 @@ import can
 import pytest
 
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.frames import FD_LENGTHS, Account, LoggedFrame
+from triaxcal_drivers.logs.can_frames import FD_LENGTHS, Account, LoggedFrame
 
 START_S = 1_700_000_000.0
 Reader = Callable[[BinaryIO, Account], Iterator[LoggedFrame]]

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.logs import asc, blf, candump, pcap, trc
-from triaxcal_drivers.logs.frames import EXTENDED_MOST, FD_MOST, LONGEST_NS, LoggedFrame, Remark, date_ns, utc_ns, whole
+from triaxcal_drivers.logs.can_frames import (
+    EXTENDED_MOST,
+    FD_MOST,
+    LONGEST_NS,
+    LoggedFrame,
+    Remark,
+    date_ns,
+    utc_ns,
+    whole,
+)
 from triaxcal_drivers.logs.mf4 import _times_ns
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]

@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.asc import frames
-from triaxcal_drivers.logs.frames import LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 HEAD = "date Sat Sep 30 10:06:13.191 pm 2017\nbase hex  timestamps absolute\ninternal events logged\n// version 9.0.0\n"

@@ -11,7 +11,7 @@ import pytest
 
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.blf import frames
-from triaxcal_drivers.logs.frames import LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 START = (2017, 9, 6, 30, 12, 0, 0, 500)  # 2017-09-30 12:00:00.5

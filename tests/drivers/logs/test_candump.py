@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
 from triaxcal_drivers.logs.candump import frames
-from triaxcal_drivers.logs.frames import LoggedFrame, Remark
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 T = 1436509052249713000
@@ -146,7 +146,7 @@ def test_lines_without_times_before_the_first_that_has_one_are_damage_in_order(r
 
 
 def test_a_log_of_more_lines_without_times_than_are_held_has_none(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcal_drivers.logs.frames.UNTIMED_MOST", 10)
+    monkeypatch.setattr("triaxcal_drivers.logs.can_frames.UNTIMED_MOST", 10)
     untimed, timed = "  can0  101   [1]  75\n", " (1790000000.000001)  can0  101   [1]  74\n"
     found, account = read(frames, (untimed * 12 + timed).encode())
     assert [f.time_ns for f in found] == [None] * 13

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.logs.frames import Account
+from triaxcal_drivers.logs.can_frames import Account
 from triaxcal_drivers.logs.kinds import NAMES, Kind, kind_of, opened
 
 

@@ -13,7 +13,7 @@ import can
 import pytest
 
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.logs.frames import LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
 from triaxcal_drivers.logs.mf4 import frames, look_through
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from tests.drivers.logs.conftest import as_logged
-from triaxcal_drivers.logs.frames import Account, LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, opened
 
 Write = Callable[[Path, list[can.Message]], None]

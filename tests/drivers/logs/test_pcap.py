@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.frames import LoggedFrame, Remark
+from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
 from triaxcal_drivers.logs.pcap import frames
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]

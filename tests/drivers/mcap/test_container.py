@@ -9,7 +9,7 @@ import zlib
 import pytest
 import zstandard
 
-from triaxcal_drivers.logs.frames import Account
+from triaxcal_drivers.logs.can_frames import Account
 from triaxcal_drivers.mcap.container import MAGIC, LoggedMessage, McapFile
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.guest.inside.program import Command, events, records
-from tests.guest.inside.test_coming_back import decoded, send, station_file
+from tests.guest.inside.test_reconnect import decoded, send, station_file
 from tests.guest.inside.witness import Sender
 
 HOUR_S = 3600.0

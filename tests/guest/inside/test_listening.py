@@ -12,15 +12,15 @@ import pytest
 
 from tests.guest.inside.conftest import ip
 from tests.guest.inside.program import events, records, simulated_unit
-from tests.guest.inside.test_coming_back import Told, until
+from tests.guest.inside.test_reconnect import Told, until
 from tests.guest.inside.witness import ERROR, EXTENDED, REMOTE, Seen, Sender, listeners, words_of
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.interface import RawFlag
 from triaxcald.run.recording import BusRecording, State, UnitRecording
 from triaxcald.run.session import UnitSession
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE
+from triaxcald.station.reconnect import RetryPolicy
 
 BUS = """\
 format = "triaxcal.station/1"
@@ -63,7 +63,7 @@ def test_a_bus_is_recorded_frame_by_frame_as_candump_saw_it(
     witness = candump(vcan, 604)
 
     async def work() -> None:
-        running = asyncio.ensure_future(recording.run(None, Patience()))
+        running = asyncio.ensure_future(recording.run(None, RetryPolicy()))
         await until(lambda: recording.status.state is State.RECORDING)
         for i, kinds in enumerate((["-e"], ["-f", "-b"], ["-m"]), 1):
             await asyncio.to_thread(sent, vcan, 200, kinds)
@@ -97,7 +97,7 @@ def test_a_unit_and_its_bus_share_a_socket_and_the_bus_has_what_was_asked_too(
     before = listeners(vcan)
 
     async def work() -> None:
-        running = [asyncio.ensure_future(recording.run(None, Patience())) for recording in (bus, unit)]
+        running = [asyncio.ensure_future(recording.run(None, RetryPolicy())) for recording in (bus, unit)]
         for recording in bus, unit:
             await until(lambda: recording.status.state is State.RECORDING)  # noqa: B023 - it is called at once
         assert listeners(vcan) == before + 1, "one that takes all"
@@ -130,7 +130,7 @@ def test_an_interface_that_is_removed_and_added_leaves_a_gap(
     recording = recording_of(tmp_path, vcan, told)
 
     async def work() -> None:
-        running = asyncio.ensure_future(recording.run(None, Patience()))
+        running = asyncio.ensure_future(recording.run(None, RetryPolicy()))
         await until(lambda: recording.status.state is State.RECORDING)
         sender = Sender(vcan)
         sender.count(0x123, range(10))

@@ -24,9 +24,9 @@ from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import State, UnitRecording
 from triaxcald.run.session import UnitSession
-from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE
+from triaxcald.station.reconnect import RetryPolicy
 
 STATION = """\
 format = "triaxcal.station/1"
@@ -89,7 +89,7 @@ def test_an_interface_that_is_removed_and_added_leaves_a_gap_in_one_recording(
     recording = UnitRecording(UnitSession(station, station.places[0], told), lambda _: path)
 
     async def work() -> None:
-        running = asyncio.ensure_future(recording.run(None, Patience()))
+        running = asyncio.ensure_future(recording.run(None, RetryPolicy()))
         await until(lambda: recording.status.path is not None and listeners(vcan) > 0)
         sender = Sender(vcan)
         send(sender, range(50))

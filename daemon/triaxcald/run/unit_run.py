@@ -18,7 +18,7 @@ from triaxcal_drivers.errors import RegisterRefused
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
-from triaxcald.abort import Left, at_abort
+from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
@@ -53,9 +53,9 @@ from triaxcald.run.together import side_by_side
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.software import software
 from triaxcald.station.collection import Collection, Progress
-from triaxcald.station.coming_back import AtWork, Patience, Streaming
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
+from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
@@ -63,14 +63,13 @@ CERTIFICATE, REPORT = "certificate.json", "report.html"
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one unit's run ended. ``exit_code`` as the command line owes it;
-    ``error`` one line where it failed.
+    """Outcome of one unit's run.
 
-    ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words
-    what the device holds, None where nothing was to be written; ``settling``
-    the command that clears it up, None where nothing is left to be cleared up.
-    ``lost`` counts records that did not get to the disk. ``data_quality`` is
-    what may be why the readings were refused.
+    ``exit_code`` is that of the command line, ``error`` one line if the run failed.
+    ``document`` is the `triaxcal.outcome/1`. ``device_state`` describes the state of
+    the device, None if nothing was to be written; ``recovery_command`` settles it,
+    None if it is settled. ``lost`` counts records that did not reach the disk.
+    ``data_quality`` lists possible causes if the readings were refused.
     """
 
     unit: str
@@ -85,7 +84,7 @@ class Outcome:
     verification: tc.interchange.Document | None = None
     provisioned: Provisioning | None = None
     device_state: str | None = None
-    settling: str | None = None
+    recovery_command: str | None = None
     error: str | None = None
     wanted: tuple[str, ...] = ()
     lost: int = 0
@@ -93,9 +92,12 @@ class Outcome:
 
 
 class UnitRun(UnitSession):
-    """The whole line for one unit of a station. ``force`` is the reason to
-    write in spite of doubts, ``others`` the units at work beside it. ``rezero``
-    is the calibration of which the biases alone are renewed."""
+    """The whole line for one unit of a station.
+
+    ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
+    the active units of the station. ``rezero`` is a calibration whose biases alone
+    are renewed.
+    """
 
     def __init__(
         self,
@@ -106,18 +108,18 @@ class UnitRun(UnitSession):
         serials: SerialsSeen | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         force: str | None = None,
-        others: AtWork | None = None,
+        others: ActiveUnits | None = None,
         rezero: EarlierFile | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
         self.rezero = rezero
-        self.others, self.force = others or AtWork(1), force
+        self.others, self.force = others or ActiveUnits(1), force
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
         self._recording: Path | None = None
-        self._papers: dict[str, str] = {}
+        self._artifacts: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
-        self._tumble: Collection | None = None
+        self._acquisition: Collection | None = None
         self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
@@ -125,12 +127,12 @@ class UnitRun(UnitSession):
         self._lost = 0
 
     async def run(self) -> Outcome:
-        """Raises nothing, not even when it is cancelled: it says everything in
-        the outcome."""
+        """Run the line. Raises nothing, not even when cancelled: the outcome has every
+        error."""
         ending: Ending | None = None
         try:
-            patience = Patience(others=self.others)
-            async with self.place.opened(patience, partial(self.waits, patience)) as device:
+            policy = RetryPolicy(others=self.others)
+            async with self.place.opened(policy, partial(self.waits, policy)) as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
@@ -144,16 +146,16 @@ class UnitRun(UnitSession):
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
                     ending = await self._ending(device, identity, writer)
-                    self._seal(writer, ending)
+                    self._finalize(writer, ending)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
-            if self._document is None:  # what is sealed stays said
+            if self._document is None:  # a stored outcome is final
                 ending = aborted(e, self._provisioning)
-                self._papers = {}  # which speak of another ending
+                self._artifacts = {}  # they report another ending
                 if self._recording is not None:
                     self._document = self._outcome_document(ending, None)
         assert ending is not None
         try:
-            self._write_papers()
+            self._write_artifacts()
         except InputError as e:
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
             code = ending.code if ending.exit_code else Code.DISK
@@ -163,9 +165,9 @@ class UnitRun(UnitSession):
     async def _ending(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
             return await self._line(device, identity, writer)
-        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording is to be sealed
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording still gets its outcome
             if self._confirmation is not None and self._confirmation.unconfirmed:
-                self._certified = None  # it rests on records that may be another unit's
+                self._certified = None  # its records may be another unit's
             ending = aborted(e, self._provisioning)
             with suppress(RecordingError):
                 writer.event("failed", {"error": ending.reason})
@@ -173,10 +175,14 @@ class UnitRun(UnitSession):
         finally:
             self._lost = sum(writer.losses.values())
 
-    def left(self, _: float) -> Left | None:
-        """What the end at once would leave behind."""
+    def abort_notice(self, _: float) -> AbortNotice | None:
+        """State of the device after an abort at this moment."""
         p = self._provisioning
-        return None if p is None else Left(f"unit {self.name}: {text.left(p, self.station.path)}", not p.settled)
+        return (
+            None
+            if p is None
+            else AbortNotice(f"unit {self.name}: {text.abort_notice(p, self.station.path)}", not p.settled)
+        )
 
     @property
     def _provisioning(self) -> Provisioning | None:
@@ -188,9 +194,9 @@ class UnitRun(UnitSession):
             return self._provisioning.held
         return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER) if self._open_journal else Held()
 
-    def _seal(self, writer: RecordingWriter, ending: Ending) -> None:
-        """The outcome as the last attachment, with the inventory of all that is
-        before it; closes the recording."""
+    def _finalize(self, writer: RecordingWriter, ending: Ending) -> None:
+        """Store the outcome as the last attachment, with the inventory of everything
+        before it, and close the recording. From then on the outcome is final."""
         made: list[tc.interchange.Document] = []
 
         def make(contents: tc.interchange.Document) -> bytes:
@@ -212,7 +218,7 @@ class UnitRun(UnitSession):
                 registers=registers_told(back.provisioning) if back and back.provisioning else None,
                 limits=self.station.file.limits.model_dump(),
                 outside=certificate["outside"] if certificate else (),
-                digests={name: digest_of(self._papers[name].encode()) for name in sorted(self._papers)},
+                digests={name: digest_of(self._artifacts[name].encode()) for name in sorted(self._artifacts)},
                 contents=contents,
             ),
             unit=self.name,
@@ -222,31 +228,31 @@ class UnitRun(UnitSession):
             software=software(),
             supersedes=latest_of(self.station.folder, self._serial),
             journal=self._journal,
-            forced=self.force if back and back.doubts else None,
+            forced=self.force if back and back.warnings else None,
         )
 
     @property
     def _journal(self) -> str | None:
-        """Where it is still needed."""
+        """Path of the journal, as long as it is needed."""
         p = self._provisioning
         path = p.open_journal if p else self._open_journal
         return str(path) if path else None
 
     @property
-    def _settling(self) -> str | None:
+    def _recovery_command(self) -> str | None:
         if self._provisioning:
-            return text.settling(self._provisioning, self.station.path) or None
+            return text.recovery_command(self._provisioning, self.station.path) or None
         return text.unfinished(self._open_journal, self.name, self.station.path) if self._open_journal else None
 
-    def _write_papers(self) -> None:
-        """The files beside the recording, once it is closed: certificate and
-        report, the outcome last."""
+    def _write_artifacts(self) -> None:
+        """Write the files beside the closed recording: certificate, report, and the
+        outcome last."""
         if self._recording is None:
             return
-        papers = dict(self._papers)
+        artifacts = dict(self._artifacts)
         if self._document is not None:
-            papers[ATTACHMENT] = to_text(self._document)
-        for name, content in papers.items():
+            artifacts[ATTACHMENT] = to_text(self._document)
+        for name, content in artifacts.items():
             self._paths[name] = write_text(self._recording.with_suffix(f".{name}"), content)
 
     def _outcome(self, ending: Ending) -> Outcome:
@@ -255,8 +261,8 @@ class UnitRun(UnitSession):
         error = None
         if ending.verdict is Verdict.ABORTED or ending.exit_code == DISK:
             told = [ending.reason, *([state] if state and state not in ending.reason else [])]
-            if settling := self._settling:
-                told.append(settling)
+            if recovery_command := self._recovery_command:
+                told.append(recovery_command)
             error = f"unit {self.name}: {'; '.join(told)}"
         return Outcome(
             unit=self.name,
@@ -271,28 +277,29 @@ class UnitRun(UnitSession):
             verification=back.verification if back else None,
             provisioned=back.provisioning if back else None,
             device_state=state,
-            settling=self._settling,
+            recovery_command=self._recovery_command,
             error=error,
             wanted=ending.wanted,
             lost=self._lost,
-            data_quality=tuple(self._tumble.pipelines[READINGS].data_quality())
-            if self._tumble and ending.exit_code == REFUSED
+            data_quality=tuple(self._acquisition.pipelines[READINGS].data_quality())
+            if self._acquisition and ending.exit_code == REFUSED
             else (),
         )
 
     def _require_readable_journal(self, identity: IdentityRead) -> None:
-        """Before any pose is taken. Raises InputError."""
+        """Check the journals before any pose is taken. Raises InputError."""
         try:
             journals_of(self.station.folder, Owner.of(self.profile, self.name, identity.serial), self.profile)
         except InputError:
-            self._open_journal = None  # no command goes by it
+            self._open_journal = None  # no command can use it
             raise
 
     async def _require_readings_before(self, device: Device) -> None:
-        """Before any pose is taken. Raises Refused, DriverError."""
+        """Check, before any pose is taken, that the registers state their readings.
+        Raises Refused, DriverError."""
         written = self.station.file.provisioning.write and why_not_written(self.profile) is None
         if written and leaves_open(self.profile):
-            with suppress(RegisterRefused):  # what cannot be read is not written either
+            with suppress(RegisterRefused):  # an unreadable register is not written either
                 require_readings_before(self.profile, await self.registers(device))
 
     @property
@@ -301,47 +308,52 @@ class UnitRun(UnitSession):
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
-        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
-        self._tumble = tumble
-        self._confirmation = self.confirmation(device, identity, writer, tumble)
-        patience = Patience(plan.comes_back_s, others=self.others)
-        returning = self.returning(device, identity, patience, confirmation=self._confirmation)
+        acquisition = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
+        self._acquisition = acquisition
+        self._confirmation = self.confirmation(device, identity, writer, acquisition)
+        policy = RetryPolicy(plan.comes_back_s, others=self.others)
+        reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
-            await self._collect(returning, writer, tumble, READINGS, wanted)
+            await self._collect(reconnecting, writer, acquisition, READINGS, wanted)
         self.progress.stage(self.name, "fitting")
-        poses = tumble.pipelines[READINGS].finish()
-        certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
+        poses = acquisition.pipelines[READINGS].finish()
+        certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
-            await self._write(device, writer, certified.image, identity, tumble)
+            await self._write(device, writer, certified.image, identity, acquisition)
         ending = judged(
             certified.document,
             self._write_back.verification if self._write_back else None,
             self.station.file.limits,
         )
         self.progress.stage(self.name, "writing the report")
-        papers = {REPORT: await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS], ending)}
+        artifacts = {REPORT: await asyncio.to_thread(self._report, certified, acquisition.pipelines[READINGS], ending)}
         if ending.verdict is not Verdict.FAIL:
-            papers[CERTIFICATE] = to_text(certified.document)
+            artifacts[CERTIFICATE] = to_text(certified.document)
         for name, media_type in ((REPORT, "text/html"), (CERTIFICATE, "application/json")):
-            if name in papers:
-                writer.attach(name, media_type, papers[name].encode())
-        self._papers = papers
+            if name in artifacts:
+                writer.attach(name, media_type, artifacts[name].encode())
+        self._artifacts = artifacts
         return ending
 
     async def _write(
-        self, device: Device, writer: RecordingWriter, image: RegisterImage, identity: IdentityRead, tumble: Collection
+        self,
+        device: Device,
+        writer: RecordingWriter,
+        image: RegisterImage,
+        identity: IdentityRead,
+        acquisition: Collection,
     ) -> None:
         async def collect(check: Collection) -> None:
             self.progress.stage(self.name, "verifying by physics")
-            fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
+            fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
             plan = self.station.file.plan
             confirmation = self.confirmation(device, identity, writer, check)
-            patience = Patience(plan.comes_back_s, others=self.others)
-            returning = self.returning(device, identity, patience, confirmation=confirmation)
+            policy = RetryPolicy(plan.comes_back_s, others=self.others)
+            reconnecting = self.reconnecting(device, identity, policy, confirmation=confirmation)
             async with confirmation.phase():
                 await confirmation.ask()
-                await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
+                await self._collect(reconnecting, writer, check, CORRECTED, plan.check_poses, fitted)
 
         self._write_back = WriteBack(
             self.place,
@@ -355,17 +367,17 @@ class UnitRun(UnitSession):
         assert self._confirmation is not None
         async with self._confirmation.phase():  # the unit may have been silent when the poses ended
             self.progress.stage(self.name, "writing the registers")
-            examined = await self._write_back.examine(device, image, identity.serial, tumble)
-        await self._write_back.write(examined, tumble)
+            examined = await self._write_back.examine(device, image, identity.serial, acquisition)
+        await self._write_back.write(examined, acquisition)
 
-    def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
+    def _certify(self, acquisition: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
             self.place.bundle,
             self.station.file,
             self.station.text,
-            tumble.pipelines[READINGS],
+            acquisition.pipelines[READINGS],
             poses,
-            tumble.digest,
+            acquisition.digest,
             unit_name=self.name,
             serial=identity.serial,
             signs=self.place.signs,
@@ -398,14 +410,14 @@ class UnitRun(UnitSession):
         )
 
     async def check(self) -> Verification:
-        """Records nothing and writes nothing: only asks the device, in check
-        poses, for its own corrected output."""
+        """Verify the device's own corrected output in check poses; records and writes
+        nothing."""
         async with self.place.opened() as device:
             identity = await self.identify(device)
             self.progress.stage(self.name, "check poses")
             check = Collection(VERIFICATION, self.place.bundle, self.place.address)
             confirmation = self.confirmation(device, identity, None, check)
-            there = self.returning(device, identity, Patience(most_s=0.0), confirmation=confirmation)
+            there = self.reconnecting(device, identity, RetryPolicy(most_s=0.0), confirmation=confirmation)
             wanted = self.station.file.plan.check_poses
             async with confirmation.phase():
                 await self._collect(there, None, check, CORRECTED, wanted)
@@ -424,15 +436,16 @@ async def run_station(
     rezero: Mapping[str, EarlierFile] | None = None,
     ended: Callable[[Outcome], None] = lambda _: None,
 ) -> list[Outcome]:
-    """All units of a station at once; one that fails does not stop the others,
-    and ``ended`` is told of each at its end. One that is lost is waited for
-    while others are at work. ``rezero`` has the calibrations, by unit, of which
-    the biases alone are renewed.
+    """Run all units of a station side by side.
 
-    When it is cancelled, every unit is, again each time, and put in order
-    first; the outcomes then say 130.
+    A failing unit does not stop the others; a lost unit is retried while others are
+    active. ``ended`` receives each outcome. ``rezero`` maps a unit to the
+    calibration whose biases alone are renewed.
+
+    Each cancellation is passed on to every unit. The units first put their devices
+    in order; the outcomes then have exit code 130.
     """
-    serials, others = SerialsSeen(), AtWork(len(station.places))
+    serials, others = SerialsSeen(), ActiveUnits(len(station.places))
     runs = [
         UnitRun(
             station, place, progress,
@@ -451,5 +464,5 @@ async def run_station(
 
     with ExitStack() as stack:
         for run in runs:
-            stack.enter_context(at_abort(run.left))
+            stack.enter_context(at_abort(run.abort_notice))
         return await side_by_side(map(work, runs))

@@ -1,8 +1,8 @@
-"""The MCAP file as a row of records, each with its offset, checked so strictly
-that damage cannot pass.
+"""The records of an MCAP file with their offsets, checked strictly enough to detect
+all damage.
 
-The library's own readers give no offsets, do not check attachments, and trust
-the lengths they read.
+The library's own readers give no offsets, do not check attachments, and trust the
+lengths that they read.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ ATTACHMENT_LIMIT = 32 * 2**20  # a report is some MiB, the DBC of a whole vehicl
 INDEX_LIMIT = 8 * 2**20  # of the messages in one chunk
 RECORD_LIMIT = 2**20  # of all others; the longest of ours is the index of a chunk
 EXPANSION_MOST = 64
-"""So many times the file may unpack to, and one chunk: raw records come to a
-fifth or a tenth."""
+"""Largest ratio of unpacked to stored bytes of a file, plus one chunk; raw records have
+5 to 10."""
 INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
-"""Bytes of the file that each message has in an index, uncompressed. Those of a
-last chunk may have none."""
-_BLOCK = 2**16  # bytes that are looked at at once
+"""Bytes of each message in the uncompressed index of the file; number of messages that
+may lack an index, those of a last chunk."""
+_BLOCK = 2**16  # bytes read at once
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
@@ -69,7 +69,7 @@ _LIMITS: Mapping[int, int] = {
 
 
 class Damage(RecordingError):
-    """The bytes at ``offset`` are not what an MCAP file has there."""
+    """The bytes at ``offset`` are not valid MCAP."""
 
     def __init__(self, name: str, offset: int, what: str) -> None:
         super().__init__(f"{name}: {what} at byte {offset}; mend it with `triaxcal log recover`")
@@ -78,13 +78,12 @@ class Damage(RecordingError):
 
 
 class CutShort(Damage):
-    """The file ends before the record that begins at ``offset``, or in its
-    middle."""
+    """The file ends before or inside the record at ``offset``."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One record of the file: ``body`` is what follows its opcode and length."""
+class UnparsedRecord:
+    """One MCAP record, not yet parsed: ``body`` follows its opcode and length."""
 
     offset: int
     opcode: int
@@ -100,8 +99,8 @@ class Frame:
 
 
 def check_magic(stream: BinaryIO, name: str) -> None:
-    """Raises CutShort where the file ends inside the magic, RecordingError
-    where it is something else."""
+    """Check the magic. Raises CutShort if the file ends inside it, RecordingError if it
+    is another file."""
     stream.seek(0)
     head = stream.read(HEAD_LOOKED_AT)
     magic = head[: len(MAGIC)]
@@ -117,8 +116,8 @@ def size_of(stream: BinaryIO) -> int:
 
 
 def written_to(stream: BinaryIO, size: int) -> int:
-    """Where the zeros begin that a file of ``size`` bytes ends with. After a
-    power failure a file may be longer than what of it reached the disk."""
+    """Offset of the trailing zeros of a file of ``size`` bytes. After a power failure a
+    file may be longer than its data that reached the disk."""
     end = size
     while end:
         begin = max(0, end - _BLOCK)
@@ -129,7 +128,7 @@ def written_to(stream: BinaryIO, size: int) -> int:
     return 0
 
 
-def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
+def unparsed_at(stream: BinaryIO, name: str, offset: int, size: int) -> UnparsedRecord:
     """The record at ``offset`` of a file of ``size`` bytes. Raises CutShort,
     Damage."""
     stream.seek(offset)
@@ -144,28 +143,28 @@ def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
     limit = _LIMITS.get(opcode, RECORD_LIMIT)
     if length > limit:
         raise Damage(name, offset, f"{_kind(opcode)} record of {length} bytes, expected at most {limit},")
-    return Frame(offset, opcode, stream.read(length))
+    return UnparsedRecord(offset, opcode, stream.read(length))
 
 
 def _kind(opcode: int) -> str:
     return Opcode(opcode).name.lower().replace("_", " ")
 
 
-def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
+def walk(stream: BinaryIO, name: str, size: int) -> Iterator[UnparsedRecord]:
     """All records in order, from the header to the footer. Raises CutShort,
     Damage."""
     offset = len(MAGIC)
     while True:
-        frame = frame_at(stream, name, offset, size)
-        yield frame
-        offset = frame.end
-        if frame.opcode == Opcode.FOOTER:
+        unparsed = unparsed_at(stream, name, offset, size)
+        yield unparsed
+        offset = unparsed.end
+        if unparsed.opcode == Opcode.FOOTER:
             return
 
 
 def _index(stream: ReadDataStream) -> MessageIndex:
-    """Its entries, of which nothing here makes use, stay bytes: as numbers they
-    would take ten times the memory."""
+    """A message index without its unused entries, which as numbers would take ten times
+    the memory."""
     channel_id = stream.read2()
     stream.read(stream.read4())
     return MessageIndex(channel_id, [])
@@ -188,37 +187,37 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 }
 
 
-def parse(frame: Frame, name: str) -> McapRecord:
-    """The record in ``frame``, which must be as long as it says; chunks are for
-    `chunk_data`. Raises Damage."""
-    kind = _kind(frame.opcode)
-    read = _READERS.get(frame.opcode)
+def parse(unparsed: UnparsedRecord, name: str) -> McapRecord:
+    """Parse a record whose length must be exact; `chunk_data` reads chunks. Raises
+    Damage."""
+    kind = _kind(unparsed.opcode)
+    read = _READERS.get(unparsed.opcode)
     if read is None:
-        raise Damage(name, frame.offset, f"a {kind} record out of place")
-    stream = ReadDataStream(io.BytesIO(frame.body))
+        raise Damage(name, unparsed.offset, f"a {kind} record out of place")
+    stream = ReadDataStream(io.BytesIO(unparsed.body))
     try:
         record = read(stream)
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as e:
-        raise Damage(name, frame.offset, f"unreadable {kind} record") from e
-    if stream.count != len(frame.body):
-        raise Damage(name, frame.offset, f"{kind} record of the wrong length")
+        raise Damage(name, unparsed.offset, f"unreadable {kind} record") from e
+    if stream.count != len(unparsed.body):
+        raise Damage(name, unparsed.offset, f"{kind} record of the wrong length")
     if isinstance(record, Attachment):
-        (crc,) = struct.unpack("<I", frame.body[-4:])
-        if crc not in (0, zlib.crc32(memoryview(frame.body)[:-4])):
-            raise Damage(name, frame.offset, f"attachment '{record.name}' fails its CRC")
+        (crc,) = struct.unpack("<I", unparsed.body[-4:])
+        if crc not in (0, zlib.crc32(memoryview(unparsed.body)[:-4])):
+            raise Damage(name, unparsed.offset, f"attachment '{record.name}' fails its CRC")
     return record
 
 
-def footer_fits(frame: Frame, crc: int) -> bool:
-    """Whether the footer's CRC is that of the summary before it, whose running
-    CRC is ``crc``."""
-    (expected,) = struct.unpack("<I", frame.body[-4:])
-    return expected in (0, zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc)))
+def footer_fits(unparsed: UnparsedRecord, crc: int) -> bool:
+    """Whether the footer's CRC matches the summary before it, whose running CRC is
+    ``crc``."""
+    (expected,) = struct.unpack("<I", unparsed.body[-4:])
+    return expected in (0, zlib.crc32(unparsed.body[:-4], zlib.crc32(unparsed.head, crc)))
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
-    """A chunk with what there is of its data, and the length these should have;
-    None where it cannot be."""
+    """A chunk with the available part of its data, and their stated length; None if the
+    bytes are no chunk."""
     try:
         start, end, uncompressed_size, crc = _CHUNK_HEAD.unpack_from(body)
         (name_length,) = struct.unpack_from("<I", body, _CHUNK_HEAD.size)
@@ -233,25 +232,25 @@ def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
     return Chunk(compression, data, end, start, crc, uncompressed_size), length
 
 
-def whole_chunk_head(frame: Frame, name: str) -> Chunk:
-    """The chunk in ``frame``, still compressed. Raises Damage where its lengths
+def whole_chunk_head(unparsed: UnparsedRecord, name: str) -> Chunk:
+    """The chunk in ``unparsed``, still compressed. Raises Damage where its lengths
     do not agree."""
-    found = chunk_head(frame.body)
+    found = chunk_head(unparsed.body)
     if found is None:
-        raise Damage(name, frame.offset, "unreadable chunk (expected zstd or no compression)")
+        raise Damage(name, unparsed.offset, "unreadable chunk (expected zstd or no compression)")
     chunk, length = found
     size = _CHUNK_HEAD.size + 4 + len(chunk.compression) + 8 + length
-    if size != len(frame.body):
-        raise Damage(name, frame.offset, "chunk of the wrong length")
+    if size != len(unparsed.body):
+        raise Damage(name, unparsed.offset, "chunk of the wrong length")
     return chunk
 
 
-def chunk_data(frame: Frame, name: str) -> bytes:
+def chunk_data(unparsed: UnparsedRecord, name: str) -> bytes:
     """The records inside the chunk, decompressed, their CRC checked. Raises
     Damage."""
-    data = unpack(whole_chunk_head(frame, name))
+    data = unpack(whole_chunk_head(unparsed, name))
     if data is None:
-        raise Damage(name, frame.offset, "a chunk fails its CRC")
+        raise Damage(name, unparsed.offset, "a chunk fails its CRC")
     return data
 
 
@@ -260,7 +259,7 @@ def unpack(chunk: Chunk) -> bytes | None:
     data = chunk.data
     if chunk.compression == "zstd":
         try:
-            # The frame's own size decides how much memory is taken: check it
+            # The zstd frame's own size decides how much memory is taken: check it
             # first.
             if zstandard.frame_content_size(data) != chunk.uncompressed_size:
                 return None
@@ -273,8 +272,8 @@ def unpack(chunk: Chunk) -> bytes | None:
 
 
 def unpack_part(chunk: Chunk) -> bytes:
-    """The records of a chunk that was cut off, as far as its bytes go; no CRC
-    can vouch for them."""
+    """The records of a truncated chunk, as far as its bytes go, without a check of
+    their CRC."""
     if chunk.compression != "zstd":
         return chunk.data
     source = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT).stream_reader(io.BytesIO(chunk.data))
@@ -285,17 +284,17 @@ def unpack_part(chunk: Chunk) -> bytes:
 
 
 class Unpacked:
-    """Counts what a file's chunks unpack to, which has to stay in proportion to
-    the file: a few bytes of compressed nothing keep a reader busy for as long
-    as they like. Raises RecordingError where it does not."""
+    """Limits the unpacked size of a file's chunks to a multiple of the file: a few
+    compressed bytes could keep a reader busy without end. Raises RecordingError above
+    the limit."""
 
     def __init__(self, name: str, size: int) -> None:
         self._name = name
         self._bytes = EXPANSION_MOST * size + CHUNK_LIMIT
         self._records = size // INDEX_ENTRY + UNINDEXED_MOST
 
-    def chunk(self, frame: Frame) -> None:
-        found = chunk_head(frame.body)
+    def chunk(self, unparsed: UnparsedRecord) -> None:
+        found = chunk_head(unparsed.body)
         self._bytes -= found[0].uncompressed_size if found else 0
         if self._bytes < 0:
             raise RecordingError(f"{self._name}: its chunks unpack to more than {EXPANSION_MOST} times the file")
@@ -307,8 +306,8 @@ class Unpacked:
 
 
 def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
-    """The whole records in ``data``; a last one that is cut off is left out.
-    Raises Damage, by its place in ``data``.
+    """The complete records in ``data``, without a truncated last one. Raises Damage
+    with its offset in ``data``.
 
     A chunk holds nothing but schemas, channels and messages.
     """
@@ -323,7 +322,7 @@ def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
             channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
             yield Message(channel_id, log_time, data[start + _MESSAGE_HEAD.size : end], publish_time, sequence)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = parse(Frame(at, opcode, data[start:end]), "chunk")
+            record = parse(UnparsedRecord(at, opcode, data[start:end]), "chunk")
             assert isinstance(record, Schema | Channel)
             yield record
         else:

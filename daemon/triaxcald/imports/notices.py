@@ -1,4 +1,4 @@
-"""What is said of an import, in English."""
+"""Messages about an import, in English."""
 
 from __future__ import annotations
 

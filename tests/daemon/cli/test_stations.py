@@ -12,9 +12,9 @@ from triaxcal.planning import directions
 from triaxcal.rounding import concise
 from triaxcal.synthetic import noisy_poses
 from triaxcald.certificate import Certified
-from triaxcald.cli.line import show_outcome
+from triaxcald.cli.stations import show_outcome
 from triaxcald.provision.state import Held
-from triaxcald.run.line import Outcome
+from triaxcald.run.unit_run import Outcome
 
 UNIT = Sensor(
     np.array([2.0, 2.1, 1.9]), np.array([0.01, -0.005, 0.004]), np.array([0.003, -0.002, 0.001]),

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from tests.drivers.virtual_time import run, virtual
-from triaxcal_drivers.attention import TICK_S
 from triaxcal_drivers.errors import BusError, DeviceSilent
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.line import ModbusClient
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import READ_HOLDING, TcpAddress
+from triaxcal_drivers.stall_clock import TICK_S
 
 HELD_UP_S = 30.0
 Reply = Callable[[bytes], bytes]

@@ -6,7 +6,7 @@ import pytest
 
 from triaxcal.interchange.calibration_document import assumed_in
 from triaxcal.uncertainty.statements import ThermometerAt, UnmodelledTemperature
-from triaxcald.doubts import assumption, none_could_show
+from triaxcald.caveats import assumption, none_could_show
 
 
 @pytest.mark.parametrize(

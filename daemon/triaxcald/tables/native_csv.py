@@ -1,5 +1,5 @@
-"""Reads samples from text of our own layout: fast where all is well, exact
-about the first fault where it is not."""
+"""Reads samples from the native CSV: fast for valid files, exact about the first
+fault of others."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros
 _SKIP = "--skip-bad leaves such lines out"
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMENTS = re.compile(r"^(?:[ \t]*#[^\n]*(?:\n|\Z))++", re.MULTILINE)
-_NOTHING = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
+_BLANK = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
 
 
 @dataclass(frozen=True)
 class CsvSamples:
-    """``time_ns`` (n,) strictly increasing, on the file's own zero;
-    ``readings`` (n,3); ``channels`` (n,) each.
+    """Samples of a file: ``time_ns`` (n,) strictly increasing, from the file's own
+    zero; ``readings`` (n,3); ``channels`` (n,) each.
 
-    ``duplicates`` rows that repeated the row before them exactly; they are left
-    out.
+    ``duplicates`` counts rows that repeat the row before them exactly; they are
+    excluded.
     """
 
     time_ns: NDArray[np.int64]
@@ -47,8 +47,8 @@ class CsvSamples:
 
 
 def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSamples:
-    """From a ``.csv`` or ``.csv.gz`` file, from standard input (``-``) or from
-    a stream of bytes.
+    """Read a ``.csv`` or ``.csv.gz`` file, standard input (``-``) or a stream of
+    bytes.
 
     ``name`` stands for the input in messages. Raises InputError: file, line,
     field, what was expected.
@@ -62,7 +62,7 @@ def samples_of_blocks(data: Iterable[bytes], label: str) -> CsvSamples:
     return _Parse(label).run(data)
 
 
-def is_own(head: bytes) -> bool:
+def is_native(head: bytes) -> bool:
     """Whether text that begins so has our header, behind comments at most."""
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
     first = next((line for line in map(bytes.strip, lines) if line and not line.startswith(b"#")), b"")
@@ -173,7 +173,7 @@ class _Parse:
 
     def _header(self, text: str) -> str:
         """Takes the header off; what follows it."""
-        skipped = _NOTHING.match(text)
+        skipped = _BLANK.match(text)
         at = skipped.end() if skipped else 0
         end = text.find("\n", at) + 1 or len(text)
         line = text[at:end].strip()

@@ -12,11 +12,11 @@ import pytest
 from canopen.sdo.exceptions import SdoCommunicationError
 
 from tests.drivers.virtual_time import run, virtual
-from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import PatientSdo
 from triaxcal_drivers.can.line import BATCH_S, FrameQueue
 from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.stall_clock import TICK_S, StallTolerantClock
 from triaxcal_drivers.two_senders import Answers
 
 HELD_UP_S = 30.0
@@ -25,7 +25,7 @@ FRAME = Frame(1_700_000_000_000_000_000, 0x185, 0, b"\1\2")
 
 
 def opened() -> FrameQueue:
-    frames = FrameQueue(Attention(asyncio.get_running_loop()))
+    frames = FrameQueue(StallTolerantClock(asyncio.get_running_loop()))
     frames.open({(0x185, False)})
     return frames
 
@@ -70,15 +70,15 @@ def test_where_no_frame_comes_that_is_told_in_its_time() -> None:
 
 
 class Clock:
-    """In the place of an event loop's attention: a second a look, or none where the loop is ``held_up``."""
+    """In the place of an event loop's clock: one second per call, or none where the loop is ``held_up``."""
 
     def __init__(self, held_up: bool) -> None:
         self.held_up = held_up
-        self.looks = 0
+        self.calls = 0
 
     def now_s(self) -> float:
-        self.looks += 1
-        return 0.0 if self.held_up else float(self.looks)
+        self.calls += 1
+        return 0.0 if self.held_up else float(self.calls)
 
 
 def client(clock: Clock) -> tuple[PatientSdo, list[bytes]]:
@@ -98,9 +98,9 @@ def answering() -> Iterator[Any]:
     """Answers once the waiting client has looked at the clock so many times."""
     threads = []
 
-    def start(sdo: PatientSdo, clock: Clock, looks: int) -> None:
+    def start(sdo: PatientSdo, clock: Clock, calls: int) -> None:
         def answer() -> None:
-            while clock.looks < looks:
+            while clock.calls < calls:
                 pass
             sdo.on_response(0x585, ANSWER, 0.0)
 
@@ -124,7 +124,7 @@ def test_without_an_answer_the_transfer_is_aborted_in_its_time() -> None:
     sdo, sent = client(clock)
     with pytest.raises(SdoCommunicationError):
         sdo.upload(0x1018, 1)
-    assert clock.looks == 4, "begun at 1 s, it has run out at 4 s"
+    assert clock.calls == 4, "begun at 1 s, it has run out at 4 s"
     assert sent[-1].hex(" ") == "80 00 00 00 00 00 04 05"
 
 

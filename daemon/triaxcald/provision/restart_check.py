@@ -1,4 +1,4 @@
-"""Restarts a device and shows whether it restarted."""
+"""Restarts a device and checks that it restarted."""
 
 from __future__ import annotations
 
@@ -15,164 +15,165 @@ from triaxcald.provision.identity import WrongUnit, check_identity
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 
 ATTEMPTS = 2
-"""A restart command is lost at times, and is not repeated by the link. The
-second attempt uses another mark."""
+"""A restart command may get lost, and the link does not repeat it. The second
+attempt uses another probe."""
 SEQUENCES: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
 BITS = (1, 2, 4)
-"""Bits that a mark may differ by: one for each attempt, and one in reserve for
-a value that equals a stored one."""
+"""Bits by which a probe may differ from the register's value: one for each attempt,
+and one in reserve for a value that equals a stored one."""
 REGISTERS_TRIED = 3
 """A register may refuse a value beyond limits that its profile does not state."""
 
 
 @dataclass(frozen=True)
 class Restart:
-    """What a restart command showed. ``acknowledged`` alone proves nothing:
-    `proven_restart` says why. ``mark_gone``: a value that was in use, and
-    stored nowhere, was gone afterwards."""
+    """Result of a restart command.
+
+    ``acknowledged`` alone proves nothing (see `checked_restart`). ``probe_gone``: a
+    value in use that was stored nowhere was gone afterwards.
+    """
 
     acknowledged: bool
-    mark_gone: bool
+    probe_gone: bool
 
 
 @dataclass(frozen=True)
-class _Mark:
-    """A register that ``held`` a value and was given another one, ``put``.
-    ``taken``: the register read back ``put``."""
+class _Probe:
+    """A register whose ``original`` value was replaced by ``value``. ``taken``: the
+    register read back ``value``."""
 
     name: str
-    held: bytes
-    put: bytes
+    original: bytes
+    value: bytes
     taken: bool
 
 
-async def proven_restart(
+async def checked_restart(
     link: RegisterLink, bundle: Bundle, serial: str | None, *known: Mapping[str, bytes]
 ) -> Restart:
-    """Restart the unit of that serial number, and show whether it restarted.
+    """Restart the unit of that serial number, and check that it restarted.
 
     An acknowledgement is no proof: the command may reach a wrong register, a
-    locked device may ignore it, or the device may carry it out later. So one
-    register in use first gets a mark: a value that is stored nowhere, one bit
-    off from the value that it holds. Only a restart takes the mark away. The
-    register gets its value back if the restart fails or does not show; while two
-    units answer, a restart is sent in its place.
+    locked device may ignore it, or the device may execute it later. So one register
+    in use first gets a probe: a value that is stored nowhere and differs by one bit
+    from the register's own. Only a restart removes the probe. The register gets its
+    value back if the restart fails or the probe stays. While two units answer, the
+    function restarts them instead of writing.
 
-    ``known`` are register images, one of which is stored: no mark equals them.
-    No register gets a mark where writes last without a store, or where the
-    device refuses the values. Raises ProvisionError if the register does not
-    take its value again; WrongUnit; RegisterRefused, other DriverError,
-    SequenceStalled of the restart.
+    ``known`` are register images, one of which is stored: no probe equals them. No
+    register gets a probe if writes last without a store, or if the device refuses
+    the values. Raises ProvisionError if the register does not take its value back;
+    WrongUnit; RegisterRefused, other DriverError or SequenceStalled of the restart.
     """
     touched = set(link.touched)
-    mark: _Mark | None = None
+    probe: _Probe | None = None
     try:
-        mark = await _marked(link, bundle, serial, known)
-        if mark is None:
-            return Restart(await run_sequence(link, bundle, "reset"), mark_gone=False)
-        restart, mark = await _restarted(link, bundle, serial, mark, known)
-    except TwoAnswer:  # the mark may be in use in both units, and only a restart takes it away from either
+        probe = await _with_probe(link, bundle, serial, known)
+        if probe is None:
+            return Restart(await run_sequence(link, bundle, "reset"), probe_gone=False)
+        restart, probe = await _restarted(link, bundle, serial, probe, known)
+    except TwoAnswer:  # both units may hold the probe, and only a restart removes it from both
         link.tolerate()
         with suppress(DriverError, StationError):
             await lock_quietly(link, bundle)
             await run_sequence(link, bundle, "reset")
         raise
     except BaseException as e:
-        if mark is None:
+        if probe is None:
             raise
         try:
-            await _put_back(link, bundle, serial, mark)
+            await _put_back(link, bundle, serial, probe)
         except (DriverError, StationError):
-            if isinstance(e, RegisterRefused):  # it answers, and keeps a value that nobody wants
+            if isinstance(e, RegisterRefused):  # the device answers, but keeps the probe
                 raise
         raise
-    if not restart.mark_gone and await _read_again(link, bundle.profile, mark.name) == mark.put:
-        await _put_back(link, bundle, serial, mark)
-    if mark.name not in touched:  # the register holds what it would hold without the mark
-        link.touched.discard(mark.name)
+    if not restart.probe_gone and await _read_again(link, bundle.profile, probe.name) == probe.value:
+        await _put_back(link, bundle, serial, probe)
+    if probe.name not in touched:  # the register holds its own value again
+        link.touched.discard(probe.name)
     return restart
 
 
 async def _restarted(
-    link: RegisterLink, bundle: Bundle, serial: str | None, mark: _Mark, known: Collection[Mapping[str, bytes]]
-) -> tuple[Restart, _Mark]:
-    """Send the restart command until the mark is gone; the mark that was used
-    last."""
-    used = [mark.put]
+    link: RegisterLink, bundle: Bundle, serial: str | None, probe: _Probe, known: Collection[Mapping[str, bytes]]
+) -> tuple[Restart, _Probe]:
+    """Send the restart command until the probe is gone, `ATTEMPTS` times at most;
+    the result and the last probe."""
+    used = [probe.value]
     while True:
-        # A device may drop what is not stored when it is locked. Then the mark
-        # is gone before the restart, and shows nothing.
-        standing = mark.taken and await _is(link, mark.name, mark.put)
+        # A device may discard unstored values when it is locked. Then the probe is
+        # gone before the restart and proves nothing.
+        in_use = probe.taken and await _is(link, probe.name, probe.value)
         link.refresh()
         acknowledged = await run_sequence(link, bundle, "reset")
-        if await _read_again(link, bundle.profile, mark.name) != mark.put:
-            return Restart(acknowledged, mark_gone=standing), mark
-        # Either the device did not restart, or its store spoiled just this bit.
-        # Another mark tells these apart.
-        other = next(_others(bundle.profile, mark.name, mark.held, known, used), None)
+        if await _read_again(link, bundle.profile, probe.name) != probe.value:
+            return Restart(acknowledged, probe_gone=in_use), probe
+        # The probe is still there: the device did not restart, or its store flipped
+        # exactly this bit. Another probe distinguishes the two.
+        other = next(_others(bundle.profile, probe.name, probe.original, known, used), None)
         if len(used) == ATTEMPTS or other is None:
-            return Restart(acknowledged, mark_gone=False), mark
+            return Restart(acknowledged, probe_gone=False), probe
         used.append(other)
         try:
-            mark = _Mark(mark.name, mark.held, other, await _put(link, bundle, serial, mark.name, other))
+            probe = _Probe(probe.name, probe.original, other, await _put(link, bundle, serial, probe.name, other))
         except RegisterRefused:
-            return Restart(acknowledged, mark_gone=False), mark
+            return Restart(acknowledged, probe_gone=False), probe
 
 
-async def _marked(
+async def _with_probe(
     link: RegisterLink, bundle: Bundle, serial: str | None, known: Collection[Mapping[str, bytes]]
-) -> _Mark | None:
-    """None where no register may get another value, or the device refuses all
-    that are offered."""
-    if not may_mark(bundle.profile):
+) -> _Probe | None:
+    """Write a probe. None if no register may get another value, or if the device
+    refuses all values offered."""
+    if not may_probe(bundle.profile):
         return None
     for name in list(_names(bundle.profile, known))[:REGISTERS_TRIED]:
-        held = await link.read(name)
-        put = next(_others(bundle.profile, name, held, known), None)
-        if put is not None:
+        original = await link.read(name)
+        value = next(_others(bundle.profile, name, original, known), None)
+        if value is not None:
             with suppress(RegisterRefused):
-                return _Mark(name, held, put, await _put(link, bundle, serial, name, put))
+                return _Probe(name, original, value, await _put(link, bundle, serial, name, value))
     return None
 
 
 def _others(
     profile: Profile, name: str, held: bytes, known: Collection[Mapping[str, bytes]], used: Collection[bytes] = ()
 ) -> Iterator[bytes]:
-    """Values for a mark: none that is stored, or was used before."""
+    """Candidate values of a probe: neither stored nor used before."""
     taken = [*used, *(registers.get(name) for registers in known)]
-    return (other for other in beside(profile, name, held) if other not in taken)
+    return (other for other in neighbouring_values(profile, name, held) if other not in taken)
 
 
 def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator[str]:
-    """Registers for a mark: first those that are written anyhow, never the
-    checksum."""
+    """Candidate registers of a probe: first those that differ between the images and
+    are written anyway, never the checksum."""
     checksum = profile.crc.register_name if profile.crc else None
     names = dict.fromkeys(name for registers in known for name in registers if name != checksum)
     yield from sorted(names, key=lambda name: len({registers.get(name) for registers in known}) == 1)
 
 
-def may_mark(profile: Profile) -> bool:
-    """Whether a register may get a mark: no write lasts without the store, and
-    no other sequence stores."""
+def may_probe(profile: Profile) -> bool:
+    """Whether a register may get a probe: no write lasts without the store, and no
+    other sequence stores."""
     elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset")
     store = writes_of(profile, "store") - writes_of(profile, "unlock")
     return bool(store) and not store & elsewhere
 
 
 def own_steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
-    """The writes of a sequence that are in no other one, as a key is; all of
-    them where there are none."""
+    """The writes of a sequence that no other sequence has; all of its writes if
+    there are none. A key is such a shared write."""
     mine = writes_of(profile, label)
     return mine - {step for other in SEQUENCES if other != label for step in writes_of(profile, other)} or mine
 
 
 def writes_of(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
-    """Of a sequence, as registers and values."""
+    """The writes of a sequence: registers and raw values."""
     steps = getattr(profile.sequences, label)
     return {(s.write, profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
 
 
-def beside(profile: Profile, name: str, raw: bytes) -> list[bytes]:
+def neighbouring_values(profile: Profile, name: str, raw: bytes) -> list[bytes]:
     """Values within the register's limits that differ from ``raw`` by one of
     the three lowest bits, the nearest first. The lowest bits lie in the last
     byte, or in the first one if the least significant byte comes first."""
@@ -188,8 +189,10 @@ def beside(profile: Profile, name: str, raw: bytes) -> list[bytes]:
 
 
 async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str, raw: bytes) -> bool:
-    """Whether the register read back the value. Raises WrongUnit, with nothing
-    written; RegisterRefused of the write."""
+    """Write a value in use; whether the register read it back.
+
+    Raises WrongUnit, with nothing written; RegisterRefused of the write.
+    """
     try:
         await check_identity(link, bundle, serial)
         await run_sequence(link, bundle, "unlock")
@@ -199,7 +202,7 @@ async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str
     except (*NO_CONTACT, RegisterRefused, StationError):
         link.refresh()
         return False
-    link.marked.append(name)
+    link.probed.append(name)
     try:
         await link.write(name, raw)
         taken = await _is(link, name, raw)
@@ -218,15 +221,16 @@ async def _is(link: RegisterLink, name: str, raw: bytes) -> bool:
         return False
 
 
-async def _put_back(link: RegisterLink, bundle: Bundle, serial: str | None, mark: _Mark) -> None:
+async def _put_back(link: RegisterLink, bundle: Bundle, serial: str | None, probe: _Probe) -> None:
     with suppress(RegisterRefused):
-        if await _put(link, bundle, serial, mark.name, mark.held):
+        if await _put(link, bundle, serial, probe.name, probe.original):
             return
-    raise ProvisionError(f"register {mark.name} does not take its value again")
+    raise ProvisionError(f"register {probe.name} does not take its value again")
 
 
 async def _read_again(link: RegisterLink, profile: Profile, name: str) -> bytes:
-    """A device that has just started may need a new connection."""
+    """Read after a restart; a device that has just started may need a new
+    connection."""
     try:
         return await link.read(name)
     except NO_CONTACT:

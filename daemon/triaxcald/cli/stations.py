@@ -1,4 +1,4 @@
-"""demo, run, sim."""
+"""The commands demo, run and sim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
-    from triaxcald.run.line import Outcome
+    from triaxcald.run.unit_run import Outcome
     from triaxcald.simulation.bench import SimulatedUnit
 
 
@@ -35,7 +35,7 @@ def run_command(a: argparse.Namespace) -> int:
 
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
-    from triaxcald.run.line import run_station
+    from triaxcald.run.unit_run import run_station
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
@@ -50,8 +50,12 @@ def run_command(a: argparse.Namespace) -> int:
 
 
 def _told(outcomes: Sequence[Outcome]) -> str:
-    """What came of the units of which no error was said."""
-    each = [(o, [f"{o.document['verdict']}: {o.document['reason']}", o.settling]) for o in outcomes if o.error is None]
+    """Outcomes of the units without an error message."""
+    each = [
+        (o, [f"{o.document['verdict']}: {o.document['reason']}", o.recovery_command])
+        for o in outcomes
+        if o.error is None
+    ]
     return "; ".join(f"unit {o.unit}: {'; '.join(filter(None, told))}" for o, told in each)
 
 
@@ -93,7 +97,7 @@ def say_error(o: Outcome) -> None:
 
 
 def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
-    """The before / after table of one unit, and where its papers are."""
+    """The before / after table of one unit, and where its artifacts are."""
 
     assert o.certified is not None
     c, v = o.certified.calibration, o.verification
@@ -126,8 +130,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
             show(f"    {name} {tc.rounding.concise(value, error, unit)}")
     if o.provisioned:
         show(f"  {text.provisioned(o.provisioned)}")
-    if o.settling and o.error is None:
-        show(f"  {o.settling}")
+    if o.recovery_command and o.error is None:
+        show(f"  {o.recovery_command}")
     if v:
         left_out = sum(not p["used"] for p in v["poses"])
         poses = f"; {counted(len(v['poses']), left_out, 'check poses')}" if left_out else ""
@@ -148,8 +152,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         show(f"  creeping poses: {creep}")
     for caution in c.cautions:
         show(f"  warning: {tc.text.caution(caution)}")
-    papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
-    for what, path in papers.items():
+    artifacts = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
+    for what, path in artifacts.items():
         if path is not None:
             show(f"  {what:<12}{path}")
 

@@ -1,5 +1,5 @@
-"""Units that are lost and come back: opened again with ever longer pauses, the
-gap in their stream told."""
+"""Reconnects lost units: retries with growing pauses, and records the gap in the
+stream."""
 
 from __future__ import annotations
 
@@ -23,45 +23,47 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.lock import locked
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
-"""Between attempts, doubled each time: a unit that restarts is there again in a
-second or two, and an operator who plugs one in waits no longer than this."""
+"""Pauses between attempts, doubled each time: a restarting unit answers within a
+second or two, and an operator who plugs one in waits for the longest at most."""
 
 TICK_S = 0.001
-"""With less left there is nothing to wait for: clocks and sums of pauses are
-off by less."""
+"""A remaining time below this counts as over: it covers the rounding of clocks and
+of summed pauses."""
 
 HOLE_S = 10.0
-"""Nothing for so long is a gap, though nobody was told of a loss: a laptop
-slept, a process was stopped. Shorter holes leave a counter of 16 bits at 1 kHz
-in no doubt, and a busy machine makes them."""
+"""A silence of this length is a gap even without a reported loss: a laptop slept, a
+process was stopped. A busy machine causes shorter ones, which a 16-bit counter at
+1 kHz spans without ambiguity."""
 AGAIN_S = 60.0
-"""A complaint so soon after an opening says that this has mended nothing, and
-the next one waits for longer; it comes within some silence time-outs."""
+"""A complaint within this time after a reconnection shows that reconnecting did not
+help: the next pause is longer. Complaints come within a few silence time-outs."""
 UNHEARD = "nothing was received meanwhile"
 
 ABSENT = (BusError, DeviceAbsent, DeviceSilent, RegisterRefused)
-"""What another attempt to open a unit may mend; one that is starting may refuse
-a register."""
+"""Errors that another attempt to open may resolve; a unit that is starting may
+refuse a register."""
 LOST = (*ABSENT, WrongUnit)
-"""And of one that was there: for the wrong unit the right one may be put there
-again."""
+"""The same for a unit that was open before: the right unit may replace the wrong
+one."""
 
 
 class Exchanged(WrongUnit):
-    """Another unit answers, and records have come since the right one was last
-    identified. They may be the other unit's, so the unit is not waited for."""
+    """Another unit answers, and records have come since the last identification.
+
+    Those records may be the other unit's, so there is no retry.
+    """
 
 
 class Streaming(Protocol):
-    """What a collection takes records from."""
+    """The source of records of a collection."""
 
     def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]: ...
 
     def complain(self, trouble: Exception) -> None: ...
 
 
-class AtWork:
-    """How many units of a station are at work; those that are lost are not."""
+class ActiveUnits:
+    """Counts the active units of a station; a lost unit is not active."""
 
     def __init__(self, units: int) -> None:
         self._units = units
@@ -85,17 +87,17 @@ class AtWork:
 
 
 @dataclass(frozen=True)
-class Patience:
-    """How long a lost unit is waited for.
+class RetryPolicy:
+    """How long to retry a lost unit.
 
-    At least ``least_s``; then until ``most_s``, or until no other unit is at
-    work, for ever where neither is given. ``in_use``: also where another
-    process has it.
+    Retries last at least ``least_s``, then until ``most_s`` or until no other unit
+    is active; they never end where neither is given. ``in_use``: also retry while
+    another process holds the unit.
     """
 
     least_s: float = 0.0
     most_s: float | None = None
-    others: AtWork | None = None
+    others: ActiveUnits | None = None
     in_use: bool = False
 
     @property
@@ -110,7 +112,7 @@ class Patience:
         return self.others is not None and waited_s >= self.least_s and self.others.nobody.is_set()
 
     async def rest(self, pause_s: float, waited_s: float) -> bool:
-        """Waits ``pause_s``, or less. False where the unit is given up after
+        """Wait for ``pause_s`` or less; False if the policy gives up after
         ``waited_s``."""
         if self.is_over(waited_s):
             return False
@@ -139,11 +141,11 @@ class Patience:
 
 
 @dataclass
-class _Waiting:
-    """How far the waiting for a lost unit has gone: the first attempt is made
-    at once, the next ones ever more rarely."""
+class _Retries:
+    """State of the retries of a lost unit: the first attempt comes at once, the next
+    ones with growing pauses."""
 
-    patience: Patience
+    policy: RetryPolicy
     tell: Callable[[Exception], None]
     attempted: bool = False
     pause_s: float = FIRST_PAUSE_S
@@ -152,8 +154,8 @@ class _Waiting:
 
     @property
     def waited_s(self) -> float:
-        """Attempts take time too, and so does a unit that opens and sends
-        nothing of use."""
+        """Time since the loss [s], with the attempts themselves and with a unit that
+        opens but sends no usable record."""
         return asyncio.get_running_loop().time() - self.begun_s
 
     def say(self, trouble: Exception) -> None:
@@ -164,11 +166,13 @@ class _Waiting:
     async def until(
         self, attempt: Callable[[], Awaitable[None]], mended: tuple[type[Exception], ...], trouble: Exception
     ) -> None:
-        """Attempts until it works. Raises the last trouble once patience ends,
-        which is told only where it is waited for; and at once what is none of
-        those that an attempt may have ``mended``."""
+        """Repeat ``attempt`` until it succeeds.
+
+        Each new error is reported before the next attempt. Raises the last error
+        once the policy gives up; raises any error not in ``mended`` at once.
+        """
         while True:
-            if self.attempted and self.patience.is_over(self.waited_s):
+            if self.attempted and self.policy.is_over(self.waited_s):
                 raise trouble
             self.say(trouble)
             if self.attempted and not await self._rest():
@@ -182,17 +186,17 @@ class _Waiting:
             except mended as e:
                 trouble = e
 
-    async def beside(self, silent: DeviceSilent) -> float:
-        """So long the other streams go on without the ``silent`` one before
-        that is asked again. Raises it once patience ends."""
+    async def pause_of_silent(self, silent: DeviceSilent) -> float:
+        """Time [s] for which only the other streams are read, before the ``silent``
+        one is requested again. Raises ``silent`` once the policy gives up."""
         self.say(silent)
-        if not await self.patience.rest(0.0, self.waited_s):
+        if not await self.policy.rest(0.0, self.waited_s):
             raise silent
         return self._next_pause_s()
 
     async def _rest(self) -> bool:
-        """Until the next attempt; whether there is to be one."""
-        return await self.patience.rest(self._next_pause_s(), self.waited_s)
+        """Wait until the next attempt; False if the policy gives up."""
+        return await self.policy.rest(self._next_pause_s(), self.waited_s)
 
     def _next_pause_s(self) -> float:
         pause_s = self.pause_s
@@ -202,15 +206,15 @@ class _Waiting:
 
 @dataclass
 class _Interruption:
-    """A gap that is not over. ``awaited`` is the source that is silent while
-    others bring their records, None where none does."""
+    """An open gap. ``awaited`` is the one silent source while others send; None if
+    all are silent."""
 
     gap: Gap
     awaited: int | None = None
 
     def ended(self, batch: RawBatch, good: NDArray[np.intp]) -> RawBatch | None:
-        """The batch with the gap before it, where one of its ``good`` records
-        ends the interruption."""
+        """The batch with the closed gap before it, if one of its ``good`` records
+        ends the interruption; else None."""
         back = good if self.awaited is None else good[batch.source[good] == self.awaited]
         if not len(back):
             return None
@@ -220,78 +224,85 @@ class _Interruption:
 
 async def until_open(
     attempt: Callable[[], Awaitable[None]],
-    patience: Patience,
+    policy: RetryPolicy,
     tell: Callable[[Exception], None],
     mended: tuple[type[Exception], ...] = ABSENT,
 ) -> None:
-    """Attempts again until it works. Raises the last trouble of those that an
-    attempt may have ``mended`` once patience ends; ``tell`` is told each one
-    that is new and waited for."""
+    """Repeat ``attempt`` until it succeeds.
+
+    ``tell`` receives each new error that leads to a retry. Raises the last error
+    once the policy gives up; raises any error not in ``mended`` at once.
+    """
     try:
         await attempt()
     except mended as e:
-        with patience.waiting():
-            await _Waiting(patience, tell, attempted=True).until(attempt, mended, e)
+        with policy.waiting():
+            await _Retries(policy, tell, attempted=True).until(attempt, mended, e)
 
 
 @asynccontextmanager
-async def claimed(claim: Claim, patience: Patience | None, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
-    """Has what is claimed until the context ends. Raises DeviceInUse; once
-    ``patience`` ends where that is for such too."""
+async def claimed(claim: Claim, policy: RetryPolicy | None, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
+    """Hold the claim until the context ends.
+
+    Raises DeviceInUse: at once, or once ``policy`` gives up if it retries that.
+    """
     async with AsyncExitStack() as stack:
 
         async def attempt() -> None:
             await stack.enter_async_context(locked(claim))
 
-        if patience is not None and patience.in_use:
-            await until_open(attempt, patience, tell, (DeviceInUseElsewhere,))
+        if policy is not None and policy.in_use:
+            await until_open(attempt, policy, tell, (DeviceInUseElsewhere,))
         else:
             await attempt()
         yield
 
 
-class Returning:
-    """A device whose streams go on after an interruption.
+class ReconnectingDevice:
+    """A device whose streams continue after an interruption.
 
-    ``identify`` is asked after each return. It raises WrongUnit where another
-    unit answers and the right one may be waited for, Exchanged where it may not.
-    ``tell`` is told what is the matter, and None when it is over.
-    More than ``hole_s`` without a record is a gap.
+    ``identify`` is called after each reconnection. It raises WrongUnit if another
+    unit answers and a retry makes sense, Exchanged if none does. ``tell`` receives
+    the reason of an interruption, and None when it is over. More than ``hole_s``
+    without a record is a gap.
     """
 
     def __init__(
         self,
         device: Device,
         identify: Callable[[], Awaitable[None]],
-        patience: Patience,
+        policy: RetryPolicy,
         tell: Callable[[str | None], None],
         now_ns: Callable[[], int] = HOST.now_ns,
         *,
         hole_s: float = HOLE_S,
     ) -> None:
-        self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
+        self._device, self._identify, self._policy, self._tell = device, identify, policy, tell
         self._now_ns, self._hole_s = now_ns, hole_s
         self._complaint: Exception | None = None
 
     def complain(self, trouble: Exception) -> None:
-        """Of what the stream gave last: the device sends, but not what it is to
-        send. It is opened anew, as if it were lost."""
+        """Report that the device sends wrong data; it is then reconnected as if it
+        were lost."""
         self._complaint = trouble
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
-        """As the device's own. An interruption begins with a batch without
-        records whose gap is not over; the first record after it that is no
-        error ends the gap. Until then the unit is waited for, however often it
-        opens meanwhile. Where one stream is silent, the others go on, and the
-        first record of that one ends the gap. A hole is a gap too. Raises what
-        the device's stream does once patience ends; Exchanged at once."""
+        """The device's batches, with its interruptions as gaps.
+
+        An interruption begins with an empty batch whose gap is open; the first
+        valid record ends the gap. Until then the retries continue, even if the
+        device opens in between. If one stream is silent, the others continue, and
+        its first record ends the gap. A silence longer than ``hole_s`` is a gap
+        too. Raises the error of the device's stream once the policy gives up;
+        Exchanged at once.
+        """
         clock = asyncio.get_running_loop()
         last_ns: int | None = None
         returned_ns = self._now_ns()
         interruption: _Interruption | None = None
-        waiting = self._waiting()
+        retries = self._retries()
         asked, until_s = list(names), math.inf
-        with ExitStack() as at_rest:
+        with ExitStack() as suspended:
             while True:
                 try:
                     async with aclosing(self._of_some(asked, until_s)) as stream:
@@ -300,7 +311,7 @@ class Returning:
                             ended = None if interruption is None else interruption.ended(batch, good)
                             if ended is not None:
                                 batch, interruption = ended, None
-                                at_rest.close()
+                                suspended.close()
                                 self._tell(None)
                             for part in _parted(batch, good, last_ns, self._hole_s):
                                 yield part
@@ -317,23 +328,26 @@ class Returning:
                     interruption = _Interruption(Gap(self._since_ns(trouble, last_ns), None, str(trouble)))
                     anew = self._complaint is None or isinstance(trouble, DeviceRestarted)
                     if anew or self._now_ns() - returned_ns > AGAIN_S * 1e9:
-                        waiting = self._waiting()
-                    waiting.told = ""
-                    at_rest.enter_context(self._patience.waiting())
-                    waiting.say(trouble)
+                        retries = self._retries()
+                    retries.told = ""
+                    suspended.enter_context(self._policy.waiting())
+                    retries.say(trouble)
                     yield RawBatch.of([]).after(interruption.gap)
                 if isinstance(trouble, DeviceSilent) and trouble.stream in asked:
                     interruption.awaited = trouble.source
                     asked = [name for name in asked if name != trouble.stream]
                     if asked:
-                        until_s = clock.time() + await waiting.beside(trouble)
+                        until_s = clock.time() + await retries.pause_of_silent(trouble)
                         continue
                 asked, until_s = list(names), math.inf
-                await waiting.until(self._again, LOST, trouble)
-                self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
+                await retries.until(self._again, LOST, trouble)
+                self._complaint, returned_ns = (
+                    None,
+                    self._now_ns(),
+                )  # a complaint made meanwhile concerns the old connection
 
     async def _of_some(self, names: Sequence[str], until_s: float) -> AsyncGenerator[RawBatch, None]:
-        """These streams of the device, until then by the loop's clock."""
+        """These streams of the device, up to ``until_s`` of the loop's clock."""
         clock = asyncio.get_running_loop()
         async with aclosing(cast(Any, self._device.stream(names))) as stream:
             async for batch in stream:
@@ -342,8 +356,11 @@ class Returning:
                     return
 
     def _raise_complaint(self, interruption: _Interruption | None) -> None:
-        """Of what was sent, unless the cause is known better: a stream that is
-        silent beside the others. A restart is more than that."""
+        """Raise a pending complaint.
+
+        A silent stream is the better known cause and drops the complaint, unless
+        that reports a restart.
+        """
         known = interruption is not None and interruption.awaited is not None
         if known and not isinstance(self._complaint, DeviceRestarted):
             self._complaint = None
@@ -351,15 +368,14 @@ class Returning:
             raise self._complaint
 
     def _since_ns(self, trouble: Exception, last_ns: int | None) -> int:
-        """Since when nothing has come, or nothing of the stream that is silent
-        while others bring their records."""
+        """Start of the silence [ns]: of all streams, or of the one silent stream."""
         since_ns = self._now_ns() if last_ns is None else last_ns
         if isinstance(trouble, DeviceSilent) and trouble.source is not None:
             return min(since_ns, self._now_ns() - round(trouble.silent_s * 1e9))
         return since_ns
 
-    def _waiting(self) -> _Waiting:
-        return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))
+    def _retries(self) -> _Retries:
+        return _Retries(self._policy, lambda trouble: self._tell(str(trouble)))
 
     async def _again(self) -> None:
         await self._device.close()
@@ -368,12 +384,12 @@ class Returning:
 
 
 def _good(batch: RawBatch) -> NDArray[np.intp]:
-    """Where the records are that are no errors."""
+    """Indices of the valid records."""
     return np.flatnonzero((batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) == 0)
 
 
 def _parted(batch: RawBatch, good: NDArray[np.intp], last_ns: int | None, hole_s: float) -> Iterator[RawBatch]:
-    """The batch in parts, from each hole to the next."""
+    """The batch, split at its holes."""
     if not len(good):
         yield batch
         return

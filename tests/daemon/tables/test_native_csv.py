@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from triaxcald.errors import InputError
 from triaxcald.tables import source
-from triaxcald.tables.own_text import CsvSamples, read_csv
+from triaxcald.tables.native_csv import CsvSamples, read_csv
 
 HEAD = b"t_s,ux,uy,uz\n"
 DATASETS = Path(__file__).parents[4] / "shared" / "datasets"

@@ -12,17 +12,17 @@ from triaxcald.audit.traffic import Traffic
 from triaxcald.provision.access import RegisterAccess
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.proof import Restart, may_mark, proven_restart
 from triaxcald.provision.registers import build_image
+from triaxcald.provision.restart_check import Restart, checked_restart, may_probe
 from triaxcald.provision.sequence import SequenceStalled
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording import schema
 from triaxcald.simulation.unit import Faults
 
-NOT_SHOWN = Restart(acknowledged=True, mark_gone=False)
+NOT_SHOWN = Restart(acknowledged=True, probe_gone=False)
 
 
-def marked(bench) -> tuple[int, RegisterAccess]:
+def probed(bench) -> tuple[int, RegisterAccess]:
     """The last write of a calibration register, which is the one that shows the restart."""
     names = bench.image.raw
     return [(i, a) for i, a in enumerate(bench.records) if a.kind == "write" and a.register in names][-1]
@@ -34,9 +34,9 @@ def forged(bench, records: list[RegisterAccess]) -> set[str]:
 
 async def test_a_restart_that_took_nothing_away_is_no_proof(bench) -> None:
     await bench.provision()
-    at, mark = marked(bench)
+    at, probe = probed(bench)
     survives = [
-        replace(a, raw=mark.raw) if i > at and a.kind == "read" and a.register == mark.register else a
+        replace(a, raw=probe.raw) if i > at and a.kind == "read" and a.register == probe.register else a
         for i, a in enumerate(bench.records)
     ]
     assert {"device_state", "evidence"} <= forged(bench, survives)
@@ -44,21 +44,21 @@ async def test_a_restart_that_took_nothing_away_is_no_proof(bench) -> None:
 
 async def test_a_wrong_value_at_the_end_is_not_taken_for_a_proof(bench) -> None:
     await bench.provision()
-    _, mark = marked(bench)
-    wrong = [replace(mark), replace(mark, kind="read")]
+    _, probe = probed(bench)
+    wrong = [replace(probe), replace(probe, kind="read")]
     assert "evidence" in forged(bench, [*bench.records, *wrong])
 
 
 async def test_a_wrong_value_that_is_stored_is_not_asked_for(bench) -> None:
     await bench.provision()
-    at, mark = marked(bench)
+    at, probe = probed(bench)
     store = next(a for a in bench.records if a.kind == "write" and a.register == "store")
-    assert mark.register in forged(bench, [*bench.records[: at + 2], store, *bench.records[at + 2 :]])
+    assert probe.register in forged(bench, [*bench.records[: at + 2], store, *bench.records[at + 2 :]])
 
 
 async def test_a_calibration_that_is_new_by_one_bit_is_written_for_itself(bench) -> None:
-    beside = float(np.nextafter(np.float32(bench.old_coefficients["bias.x"]), np.float32(1)))
-    changed = {**bench.old_coefficients, "bias.x": beside}
+    neighbouring_values = float(np.nextafter(np.float32(bench.old_coefficients["bias.x"]), np.float32(1)))
+    changed = {**bench.old_coefficients, "bias.x": neighbouring_values}
     bench.image = build_image(bench.profile, changed, date_days=bench.old_date_days)
     report = await bench.provision()  # judged by the rules of an audit, too
     assert report.written == ["bias_x", "calibration_crc"]
@@ -81,17 +81,17 @@ def test_a_key_that_store_and_restart_share_is_no_store(bench) -> None:
     def step(register: str, value: int) -> schema.RegisterAccess:
         return access("write", register, profile.encode(register, value))
 
-    raw, beside = b"\x3c\x00\x00\x00", b"\x3c\x00\x00\x01"
+    raw, neighbouring_values = b"\x3c\x00\x00\x00", b"\x3c\x00\x00\x01"
     traffic = Traffic(
         [
-            access("read", "bias_x", raw), step("unlock_key", 0x5A17), access("write", "bias_x", beside),
+            access("read", "bias_x", raw), step("unlock_key", 0x5A17), access("write", "bias_x", neighbouring_values),
             step("unlock_key", 0x5A17), step("reset", 2), access("read", "bias_x", raw),
         ],
         profile,
         [("bias_x", raw)],
     )  # fmt: skip
-    (mark,) = traffic.marks.marks
-    assert (mark.at, mark.over, mark.gone_at) == ([2], True, 5)
+    (probe,) = traffic.marks.marks
+    assert (probe.at, probe.over, probe.gone_at) == ([2], True, 5)
 
 
 @pytest.mark.parametrize("struck", ["unlock_key", "scale_factor_x"])
@@ -103,14 +103,14 @@ async def test_a_proof_that_nobody_answers_prevents_no_restart(bench, struck: st
             raise DeviceSilent("no reply")
 
     bench.device.trouble = deaf
-    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
+    assert await checked_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
     assert ("write", "reset") in bench.device.log
     bench.assert_holds(bench.old)
 
 
 async def test_a_proof_is_given_to_no_other_unit(bench) -> None:
     with pytest.raises(WrongUnit):
-        await proven_restart(bench.link, bench.bundle, "0008", bench.image.raw)
+        await checked_restart(bench.link, bench.bundle, "0008", bench.image.raw)
     assert bench.device.written == []
 
 
@@ -157,22 +157,22 @@ async def test_a_value_does_not_stay_in_use_where_the_restart_stalls(bench) -> N
 
     bench.device.trouble = ignored
     with pytest.raises(SequenceStalled):
-        await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw)
+        await checked_restart(bench.link, bench.bundle, "0007", bench.image.raw)
     bench.assert_holds(bench.old)
 
 
 async def test_a_value_that_is_acknowledged_and_not_kept_shows_nothing(make_bench) -> None:
     """As of a device that is locked, and ignores writes and restarts in silence."""
     bench = make_bench(faults=Faults(corrupt_write={"scale_factor_x": 0x01}))
-    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
+    assert await checked_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
     assert ("write", "reset") in bench.device.log
 
 
 def test_nothing_is_marked_where_another_sequence_stores(bench) -> None:
-    assert may_mark(bench.profile)
+    assert may_probe(bench.profile)
     store = {"write": "store", "value": 0x65766173}
     for other in ("lock", "reset"):
         sequences = bench.profile.sequences.model_dump()
         sequences[other] = (store, *sequences[other])
         update = {"sequences": type(bench.profile.sequences).model_validate(sequences)}
-        assert not may_mark(bench.profile.model_copy(update=update))
+        assert not may_probe(bench.profile.model_copy(update=update))
