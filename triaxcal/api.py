@@ -118,8 +118,8 @@ class Diagnosis:
 
     def plot(self) -> Figure:
         """The partial residual of each finding, each candidate and an unmodelled
-        part against its driving variable, with the fitted curve and its 95 % band; without
-        findings the residuals. Raises ModuleNotFoundError without
+        part against its driving variable, with the fitted curve and its 95 % band;
+        without findings the residuals. Raises ModuleNotFoundError without
         matplotlib."""
         from triaxcal.pictures import traces_figure  # matplotlib, which nothing else needs
 
