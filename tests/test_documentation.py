@@ -607,6 +607,13 @@ def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> Non
     require_made(made)
 
 
+def test_the_pages_and_schemas_of_documents_are_those_of_their_models() -> None:
+    names = runpy.run_path(str(PROJECT / "docs/reference/documents.py"))
+    made = names["pages"]()
+    assert len(made) > len(names["MODELS"])
+    require_made(made)
+
+
 def test_the_page_of_the_effects_is_what_they_say_of_themselves() -> None:
     names = runpy.run_path(str(PROJECT / "docs/reference/effects.py"))
     require_made({names["PAGE"]: names["page"]()})

@@ -19,12 +19,13 @@ class DeviceState(StrEnum):
     """All registers read back equal after a restart that took a mark away, or
     after the supply was seen off."""
     NEW_UNVERIFIED = "new_unverified"
-    """The store was acknowledged and the registers read back equal; no restart
-    has proven it."""
+    """The store was acknowledged, or every write lasts, and the registers read
+    back equal; no restart has proven it."""
     MIXED = "mixed"
     """The registers are known to be neither the old ones nor the new ones."""
     UNKNOWN = "unknown"
-    """The link died, or a store went unanswered, and no read decided."""
+    """The link died, or a store went unanswered, and no read decided; or an
+    earlier cut was not settled."""
 
 
 class Observation(StrEnum):
@@ -47,6 +48,7 @@ class Evidence(StrEnum):
     """What the state rests on."""
 
     NOTHING_WRITTEN = "nothing_written"
+    """No calibration register was written."""
     NOTHING_STORED = "nothing_stored"
     """The registers in use read back equal, and no store was asked for."""
     READ_BACK = "read_back"
@@ -59,6 +61,7 @@ class Evidence(StrEnum):
     """The store went unanswered; the device's counter of stores shows that it
     took place, or did not."""
     NO_ANSWER = "no_answer"
+    """No read decided."""
 
 
 @dataclass
@@ -77,9 +80,9 @@ class Held:
         self.observed.add(observation)
 
     @property
-    def observations(self) -> list[str]:
-        """In the order of `Observation`, for a document."""
-        return [o.value for o in Observation if o in self.observed]
+    def observations(self) -> list[Observation]:
+        """In the order of `Observation`."""
+        return [o for o in Observation if o in self.observed]
 
     @property
     def settled(self) -> bool:
