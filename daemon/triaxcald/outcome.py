@@ -13,10 +13,11 @@ from typing import Any, Final
 import triaxcal as tc
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
-from triaxcald.schema.figures import Residual, Verification
+from triaxcald.schema.figures import Residual
 from triaxcald.schema.outcome import Code as Code
 from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Measured, Outcome, RegistersDone
 from triaxcald.schema.outcome import Verdict as Verdict
+from triaxcald.schema.verification import Verification
 
 FORMAT: Final = "triaxcal.outcome/1"
 ATTACHMENT, SUFFIX = "outcome.json", ".outcome.json"

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from triaxcald.provision.state import DeviceState, Evidence, Observation
+from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Code, Outcome, Verdict
+from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
-MODELS: dict[str, type[Model]] = {"outcome": Outcome}
+MODELS: dict[str, type[Model]] = {"certificate": Certificate, "verification": Verification, "outcome": Outcome}
 JSON_TYPES = {
     "string": "text",
     "number": "number",
@@ -25,6 +27,19 @@ JSON_TYPES = {
     "null": "`null`",
     "object": "object",
 }
+CERTIFICATE = """# Certificate
+
+`triaxcal run` and `demo` write `triaxcal.certificate/1` for each unit that did not fail: a file, and an attachment of the recording. It has no time of issue and no signature: an audit computes the same bytes. Rounding, `null` and units are those of [all documents](documents.md).
+
+Made from the models in `daemon/triaxcald/schema/` by `docs/reference/documents.py`; JSON Schema of the [certificate](certificate.schema.json) and the [verification](verification.schema.json).
+
+"""  # noqa: E501
+VERIFICATION = """
+## Verification
+
+`triaxcal.verification/1`, an attachment of the recording: the magnitude that the device itself reports, in other attitudes than the fit's.
+
+"""  # noqa: E501
 OUTCOME = """# Outcome
 
 `triaxcal run`, `provision` and `restore` end with one document, `triaxcal.outcome/1`. It says what became of the unit and what the device holds. A recording has it as its last attachment, `outcome.json`; the same bytes lie beside it as `UNIT-SERIAL-TIME.outcome.json`. `provision` and `restore` write `SERIAL-TIME.outcome.json` into the station's folder. With `--json` it stands under `units[].outcome` of `triaxcal.run/1` and under `outcome` of `triaxcal.provisioning/1` and `triaxcal.restoration/1`, with its path in `outcome_file`. An outcome is never edited: a rework writes another that names this one. If the device was not reached, or its registers were not read, there is no file. After a third signal there is none, and standard error says what the device holds.
@@ -46,7 +61,8 @@ Before the first write the journal is on the disk, with what the device held and
 def pages() -> dict[Path, str]:
     """The text of each page by its path."""
     made = {HERE / f"{name}.schema.json": json_schema(model) for name, model in MODELS.items()}
-    return made | {HERE / "outcome.md": _outcome()}
+    certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
+    return made | {HERE / "outcome.md": _outcome(), HERE / "certificate.md": certificate}
 
 
 def _outcome() -> str:
@@ -108,7 +124,7 @@ def _rows(
         key = f"{prefix}{name}"
         inner, suffix = _model_in(of, named), "[]." if "list" in _type(of, named) else "."
         known = inner and shown.get(inner)
-        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), of["description"]
+        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), of["description"].replace("|", r"\|")
         if inner and not known and "format" not in named[inner]["properties"]:
             shown[inner] = key
             yield from _rows(named[inner], named, f"{key}{suffix}", shown)
@@ -132,9 +148,10 @@ def _type(of: dict[str, Any], named: dict[str, Any]) -> str:
     if "const" in of:
         return f"`{of['const']}`"
     if of.get("type") == "array":
-        return f"list of {_type(of['items'], named)}"
+        each = _type(of["items"], named)
+        return f"list of ({each})" if " " in each else f"list of {each}"
     if isinstance(each := of.get("additionalProperties"), dict):
-        return f"{_type(each, named)} by name"
+        return f"by name: {_type(each, named)}"
     return JSON_TYPES[of["type"]]
 
 

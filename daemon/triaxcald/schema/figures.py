@@ -6,14 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from triaxcald.schema.model import Figure, Model, Sha256
+from triaxcald.schema.model import Figure, Model
 
 
 class Residual(Model):
     """Errors of the magnitude |a| in the poses, in the unit of the reference
     vector, for which g stands."""
 
-    rms_g: Annotated[Figure | None, Field(description="rms of \\|a\\| − reference over the poses [g]")]
+    rms_g: Annotated[Figure | None, Field(description="rms of |a| − reference over the poses [g]")]
     max_abs_g: Annotated[Figure | None, Field(description="largest of them without its sign [g]")]
     cross_validated_rms_g: Annotated[
         Figure | None,
@@ -39,46 +39,63 @@ class Residual(Model):
     ] = None
 
 
-class CheckPose(Model):
-    start_s: Annotated[Figure, Field(description="first sample of the still span, from the phase's first sample [s]")]
-    end_s: Annotated[Figure, Field(description="last sample of the still span, from the phase's first sample [s]")]
-    error_g: Annotated[Figure | None, Field(description="\\|a\\| − reference [g]")]
-    standard_error_g: Annotated[Figure | None, Field(description="standard error of `error_g` by noise [g]")]
-    used: Annotated[bool, Field(description="whether the pose counts")]
-    fault: Annotated[
-        str | None, Field(description="`saturation` or `stuck_output`, for which it does not count; else `null`")
-    ]
-    from_fit_deg: Annotated[Figure, Field(description="angle to the nearest attitude of the fit [°]")]
-
-
-class Verification(Model):
-    """The magnitude that the device itself reports, in other attitudes than the
-    fit's."""
-
-    format: Annotated[Literal["triaxcal.verification/1"], Field(description="format of this document")]
-    raw_sha256: Annotated[Sha256, Field(description="digest of the raw records of the phase `verification`")]
-    before_rms_g: Annotated[
-        Figure | None,
-        Field(description="rms error of the corrected output in the poses of the calibration, with old registers [g]"),
-    ]
-    after_rms_g: Annotated[
-        Figure | None, Field(description="rms error in the check poses, with new registers, after a restart [g]")
-    ]
-    after_max_abs_g: Annotated[Figure | None, Field(description="largest error in the check poses [g]")]
-    noise_floor_g: Annotated[Figure | None, Field(description="rms that noise alone makes in the check poses [g]")]
-    limit_rms_g: Annotated[Figure | None, Field(description="the station's limit of `after_rms_g` [g]; else `null`")]
-    verdict: Annotated[
-        Literal["within limits", "outside limits", "not judged", "worse than before"],
+class ByParameter(Model):
+    scale_factor: Annotated[list[Figure | None], Field(description="of x, y, z [output/g]")]
+    misalignment: Annotated[list[Figure | None], Field(description="of the three angles [rad]")]
+    bias: Annotated[list[Figure | None], Field(description="of x, y, z [g]")]
+    effects: Annotated[
+        dict[str, dict[str, Figure | None]],
         Field(
-            description="`within limits`, `outside limits`; without a limit `not judged`, "
-            "or `worse than before` (F-test at 1 %)"
+            default_factory=dict,
+            description="of each effect, by coefficient [unit of the coefficient]; absent without effects",
         ),
     ]
-    poses: Annotated[list[CheckPose], Field(description="the check poses, in the order of time")]
-    data_quality: Annotated[list[str], Field(description="faults of the corrected stream, one line each")]
-    expanded_uncertainty_g: Annotated[
-        Figure | None, Field(description="of `after_rms_g` by noise, coverage factor 2 [g]")
+
+
+class OfMagnitude(Model):
+    standard_g: Annotated[Figure | None, Field(description="standard uncertainty [g]")]
+    coverage_factor: Annotated[Figure | None, Field(description="Student's t")]
+    expanded_g: Annotated[Figure | None, Field(description="expanded uncertainty [g]")]
+
+
+class BudgetLine(Model):
+    source: Annotated[
+        str,
+        Field(
+            description="`noise`, `creep`, `lack_of_fit`, `reference`, `temperature`, `thermometer`, "
+            "`choice_of_effect`, `register_rounding`, `not_held` (effects that registers lack); after `--rezero` also "
+            "`kept` (the earlier calibration), `since` (changes between recordings), `scatter`"
+        ),
     ]
-    poses_apart: Annotated[
-        int, Field(description="number of check poses at least `plan.apart_deg` from each pose of the fit")
+    evaluation: Annotated[Literal["A", "B"], Field(description="`A` from scatter, else `B`")]
+    degrees_of_freedom: Annotated[Figure | None, Field(description="degrees of freedom; `null` is infinite")]
+    scale_factor: Annotated[list[Figure | None], Field(description="standard uncertainties of x, y, z [output/g]")]
+    misalignment: Annotated[list[Figure | None], Field(description="standard uncertainties of the three angles [rad]")]
+    bias: Annotated[list[Figure | None], Field(description="standard uncertainties of x, y, z [g]")]
+    effects: Annotated[
+        dict[str, dict[str, Figure | None]],
+        Field(
+            default_factory=dict,
+            description="standard uncertainties by effect and coefficient; absent without effects",
+        ),
     ]
+    magnitude_g: Annotated[Figure | None, Field(description="standard uncertainty of |a| [g]")]
+    share: Annotated[Figure | None, Field(description="share of the variance of |a|, 0…1")]
+    how: Annotated[str, Field(description="derivation in words")]
+    assumes: Annotated[
+        list[str], Field(default_factory=list, description="effects whose size is assumed; absent without any")
+    ]
+
+
+class Uncertainty(Model):
+    """Expanded uncertainties, and the budget that they come from."""
+
+    level: Annotated[Figure, Field(description="level of confidence, 0.95")]
+    expanded: Annotated[ByParameter, Field(description="expanded uncertainties of the parameters")]
+    coverage_factor: Annotated[ByParameter, Field(description="Student's t of each parameter")]
+    magnitude: Annotated[OfMagnitude, Field(description="of |a| over all orientations")]
+    budget: Annotated[list[BudgetLine], Field(description="standard uncertainties by source, largest first")]
+    dominant: Annotated[str, Field(description="the largest source")]
+    halved_by: Annotated[str, Field(description="an action that halves it, in words")]
+    magnitude_if_halved_g: Annotated[Figure | None, Field(description="standard uncertainty of |a| then [g]")]
+    not_evaluated: Annotated[list[str], Field(description="unknown sources, and what to state, in words")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Self, TypeVar
@@ -18,6 +19,7 @@ from pydantic import (
 )
 
 E = TypeVar("E", bound=StrEnum)
+_LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
 
 
 def _as_given(value: Any, handler: ValidatorFunctionWrapHandler) -> float:
@@ -47,7 +49,7 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
     def document(self) -> dict[str, Any]:
-        return self.model_dump(exclude_unset=True)
+        return self.model_dump(exclude_unset=True, by_alias=True)
 
     @classmethod
     def read(cls, value: object) -> Self | None:
@@ -59,6 +61,7 @@ class Model(BaseModel):
 
 
 def json_schema(model: type[Model]) -> str:
-    """As text, with a newline at its end."""
+    """As text, with a newline at its end. The links in descriptions are those
+    of the page of the reference, and stay there."""
     document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
-    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+    return _LINK.sub(r"\1", json.dumps(document, indent=2, ensure_ascii=False)) + "\n"

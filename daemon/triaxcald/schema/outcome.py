@@ -10,8 +10,9 @@ from pydantic import Field
 
 from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.state import DeviceState, Evidence, Observation
-from triaxcald.schema.figures import Residual, Verification
+from triaxcald.schema.figures import Residual
 from triaxcald.schema.model import Figure, Model, Sha256, Word
+from triaxcald.schema.verification import Verification
 
 
 class Verdict(StrEnum):
@@ -171,7 +172,7 @@ class Outcome(Model):
     serial: Annotated[str | None, Field(description="serial number; `null` without one")]
     station: Annotated[str, Field(description="name of the station")]
     ended: Annotated[str, Field(description="end of the work, UTC, ISO 8601")]
-    verdict: Annotated[Word[Verdict], Field(description="[verdict](#verdict-and-code)")]
+    verdict: Annotated[Word[Verdict], Field(description="[verdict](#verdict-and-code) on the unit")]
     code: Annotated[
         Word[Code] | None,
         Field(description="[reason for programs](#verdict-and-code); `null` after bad input and after a dry run"),

@@ -12,13 +12,19 @@ import pytest
 import triaxcal as tc
 from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording
+from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.figures import Residual
 from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Code, Outcome, Verdict
+from triaxcald.schema.verification import Verification
 
 RECORDINGS = Path(__file__).parents[3] / "recordings"
 EVERY = sorted(RECORDINGS.rglob("*.mcap"))
-MODELS: dict[str, type[Model]] = {"outcome.json": Outcome}
+MODELS: dict[str, type[Model]] = {
+    "outcome.json": Outcome,
+    "certificate.json": Certificate,
+    "verification.json": Verification,
+}
 
 
 @cache
