@@ -30,6 +30,15 @@ def _as_given(value: Any, handler: ValidatorFunctionWrapHandler) -> float:
     return value if isinstance(value, float) else checked
 
 
+def _any_text(value: Any, handler: ValidatorFunctionWrapHandler) -> str:
+    """With the surrogates that stand for bytes of a file name that are no
+    UTF-8: pydantic would refuse them, and whoever shows or writes the text
+    replaces them or says so."""
+    return value if isinstance(value, str) else handler(value)
+
+
+Text = Annotated[str, WrapValidator(_any_text)]
+"""Text that may quote the name of a file or the words of a command."""
 Figure = Annotated[float, WrapValidator(_as_given)]
 """A finite number, rounded as documents have it."""
 Word = Annotated[E, Field(strict=False), PlainSerializer(str)]

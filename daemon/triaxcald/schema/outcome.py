@@ -11,7 +11,7 @@ from pydantic import Field
 from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.figures import Residual
-from triaxcald.schema.model import Figure, Model, Sha256, Word
+from triaxcald.schema.model import Figure, Model, Sha256, Text, Word
 from triaxcald.schema.verification import Verification
 
 
@@ -118,7 +118,9 @@ class RegistersDone(Model):
     cut_short_before: Annotated[
         bool, Field(description="whether an earlier provisioning had left the device in between")
     ]
-    undoing_failed: Annotated[str | None, Field(description="reason that the old calibration is not back; else `null`")]
+    undoing_failed: Annotated[
+        Text | None, Field(description="reason that the old calibration is not back; else `null`")
+    ]
     steps: Annotated[list[str], Field(description="steps of the procedure, in order, in words")]
 
 
@@ -177,7 +179,7 @@ class Outcome(Model):
         Word[Code] | None,
         Field(description="[reason for programs](#verdict-and-code); `null` after bad input and after a dry run"),
     ] = None
-    reason: Annotated[str, Field(description="reason for people, one sentence")]
+    reason: Annotated[Text, Field(description="reason for people, one sentence")]
     exit_code: Annotated[
         int | None, Field(description="exit code of the command for this unit; `null` after an internal error")
     ]
@@ -195,8 +197,10 @@ class Outcome(Model):
     registers: Annotated[
         RegistersDone | None, Field(description="what was done to the registers; `null` if nothing was to be written")
     ]
-    forced: Annotated[str | None, Field(description="reason of `--force`, if it overruled doubts; else `null`")]
-    journal: Annotated[str | None, Field(description="path of the [journal](#journal) while it is needed; else `null`")]
+    forced: Annotated[Text | None, Field(description="reason of `--force`, if it overruled doubts; else `null`")]
+    journal: Annotated[
+        Text | None, Field(description="path of the [journal](#journal) while it is needed; else `null`")
+    ]
     limits: Annotated[
         LimitsOfOutcome,
         Field(description="limits of the station, `null` where there is none; empty after `provision` and `restore`"),

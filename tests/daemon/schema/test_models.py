@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,15 @@ def test_a_figure_keeps_what_an_audit_needs_of_it() -> None:
     ).document()
     assert found["rms_g"].exact == 1.23456789e-5
     assert list(found) == ["rms_g", "max_abs_g", "cross_validated_rms_g", "noise_floor_g", "lack_of_fit_p"]
+
+
+@pytest.mark.parametrize("key", ["reason", "forced", "journal"])
+def test_an_outcome_may_quote_a_name_that_is_no_utf_8(key: str) -> None:
+    quoted = os.fsdecode(b"/stations/\xff/journal/1.json")
+    document = golden("outcome.json") | {key: quoted}
+    read = Outcome.read(document)
+    assert read is not None
+    assert read.document() == document
 
 
 def test_a_key_that_a_later_version_adds_is_ignored() -> None:
