@@ -15,10 +15,17 @@ from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Code, Outcome, Verdict
+from triaxcald.schema.run import Demo, Run
 from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
-MODELS: dict[str, type[Model]] = {"certificate": Certificate, "verification": Verification, "outcome": Outcome}
+MODELS: dict[str, type[Model]] = {
+    "certificate": Certificate,
+    "verification": Verification,
+    "outcome": Outcome,
+    "run": Run,
+    "demo": Demo,
+}
 JSON_TYPES = {
     "string": "text",
     "number": "number",
@@ -51,6 +58,19 @@ MARK = """
 A mark is a value in use that is stored nowhere ([0012](../decisions/0012-every-write-can-be-undone.md)). If the state is open, the last line of the command names the one that settles it.
 
 """  # noqa: E501
+RUN = """# Run and demo
+
+`triaxcal run --json` prints `triaxcal.run/1`, `demo --json` prints `triaxcal.demo/1`.
+
+Made from the models in `daemon/triaxcald/schema/run.py` by `docs/reference/documents.py`; JSON Schema of a [run](run.schema.json) and a [demo](demo.schema.json).
+
+"""  # noqa: E501
+DEMO = """
+## Demo
+
+The units are simulated ones. Besides the keys of a run:
+
+"""
 JOURNAL = """
 ## Journal
 
@@ -62,7 +82,11 @@ def pages() -> dict[Path, str]:
     """The text of each page by its path."""
     made = {HERE / f"{name}.schema.json": json_schema(model) for name, model in MODELS.items()}
     certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
-    return made | {HERE / "outcome.md": _outcome(), HERE / "certificate.md": certificate}
+    of_a_run = set(_keys(Run).splitlines())
+    of_a_demo = [row for row in _keys(Demo).splitlines() if row not in of_a_run]
+    run = RUN + _keys(Run) + DEMO + "\n".join([*_keys(Run).splitlines()[:2], *of_a_demo]) + "\n"
+    texts = {"certificate": certificate, "outcome": _outcome(), "run": run}
+    return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 
 
 def _outcome() -> str:
