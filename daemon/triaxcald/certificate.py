@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -34,20 +34,12 @@ from triaxcald.doubts import is_passing
 from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
-from triaxcald.schema.certificate import (
-    Certificate,
-    LimitsOfFit,
-    NamedFile,
-    RecordingOfCertificate,
-    RegistersOfCertificate,
-    RegisterWord,
-    Settings,
-    UnitOfCertificate,
-)
-from triaxcald.schema.figures import Uncertainty
 from triaxcald.software import drawn_with as drawn_with
 from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
+
+if TYPE_CHECKING:  # the models are loaded when a document is made
+    from triaxcald.schema.certificate import RegistersOfCertificate
 
 DAY_S = 86_400
 TEMPERATURE = "temp_c"
@@ -100,6 +92,15 @@ def certify(
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
+    from triaxcald.schema.certificate import (
+        Certificate,
+        LimitsOfFit,
+        NamedFile,
+        RecordingOfCertificate,
+        Settings,
+        UnitOfCertificate,
+    )
+
     compute_with_one_thread()
     loop = updated = None
     if earlier is None:
@@ -228,6 +229,9 @@ def with_registers(
 def _registers_part(
     image: RegisterImage, held: HeldByDevice, full: tc.estimate.Calibration, poses: list[tc.Pose], stated: tc.Stated
 ) -> RegistersOfCertificate:
+    from triaxcald.schema.certificate import RegistersOfCertificate, RegisterWord
+    from triaxcald.schema.figures import Uncertainty
+
     registers = held.registers.calibration
     in_registers = list(registers.terms)
     budget = tc.uncertainty.budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost))

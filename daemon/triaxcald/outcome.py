@@ -8,16 +8,16 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
-from triaxcald.schema.figures import Residual
-from triaxcald.schema.outcome import Code as Code
-from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Measured, Outcome, RegistersDone
-from triaxcald.schema.outcome import Verdict as Verdict
-from triaxcald.schema.verification import Verification
+from triaxcald.schema.codes import Code as Code
+from triaxcald.schema.codes import Verdict as Verdict
+
+if TYPE_CHECKING:  # the models are loaded when a document is made
+    from triaxcald.schema.outcome import Measured, RegistersDone
 
 FORMAT: Final = "triaxcal.outcome/1"
 ATTACHMENT, SUFFIX = "outcome.json", ".outcome.json"
@@ -78,6 +78,9 @@ def outcome_document(
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
     needed, ``forced`` the reason for which doubts were overruled."""
+    from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Outcome
+    from triaxcald.schema.verification import Verification
+
     verification, contents = papers.verification, papers.contents
     return Outcome(
         format=FORMAT,
@@ -109,6 +112,9 @@ def outcome_document(
 
 def measured_in(certificate: Mapping[str, Any]) -> Measured:
     """The figures of the fit, as the certificate has them."""
+    from triaxcald.schema.figures import Residual
+    from triaxcald.schema.outcome import Measured
+
     recording, result = certificate["recording"], certificate["result"]
     return Measured(
         raw_sha256=recording["raw_sha256"],
@@ -122,6 +128,8 @@ def measured_in(certificate: Mapping[str, Any]) -> Measured:
 
 def registers_told(p: Provisioning) -> RegistersDone:
     """What was done to the registers, and what an undoing would bring back."""
+    from triaxcald.schema.outcome import RegistersDone
+
     return RegistersDone(
         differing=list(p.differing),
         written=list(p.written),

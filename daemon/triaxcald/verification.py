@@ -16,8 +16,6 @@ import numpy as np
 import triaxcal as tc
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.pipeline import Pipeline, of_poses
-from triaxcald.schema.verification import CheckPose
-from triaxcald.schema.verification import Verification as CheckDocument
 from triaxcald.station.guidance import ups
 
 WITHIN: Final = "within limits"
@@ -197,6 +195,9 @@ def verification_document(
     """``before``: the device's output with its old registers; ``after``: with
     the new ones, after a restart.
     """
+    from triaxcald.schema.verification import CheckPose  # most commands that verify write no such document
+    from triaxcald.schema.verification import Verification as CheckDocument
+
     angles = apart.angles_deg(after.poses)
     rows = [
         row | {"from_fit_deg": tc.rounding.degrees(float(angle))}

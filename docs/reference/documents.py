@@ -13,8 +13,9 @@ from typing import Any
 
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
+from triaxcald.schema.codes import Code, Verdict
 from triaxcald.schema.model import Model, json_schema
-from triaxcald.schema.outcome import Code, Outcome, Verdict
+from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.run import Demo, Run
 from triaxcald.schema.verification import Verification
 

@@ -18,15 +18,12 @@ from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError, severest
-from triaxcald.schema.figures import Residual
-from triaxcald.schema.outcome import Outcome as OutcomeDocument
-from triaxcald.schema.run import Demo, Run, UnitOfDemo, UnitOfRun
-from triaxcald.schema.verification import Verification
 from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
     from triaxcald.run.line import Outcome
+    from triaxcald.schema.run import UnitOfDemo, UnitOfRun
     from triaxcald.simulation.bench import SimulatedUnit
 
 
@@ -40,6 +37,7 @@ def run_command(a: argparse.Namespace) -> int:
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.line import run_station
+    from triaxcald.schema.run import Run
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
@@ -64,6 +62,11 @@ def worst(outcomes: Sequence[Outcome]) -> int:
 
 
 def _unit(o: Outcome) -> UnitOfRun:
+    from triaxcald.schema.figures import Residual
+    from triaxcald.schema.outcome import Outcome as OutcomeDocument
+    from triaxcald.schema.run import UnitOfRun
+    from triaxcald.schema.verification import Verification
+
     result = o.certified.document["result"] if o.certified else {}
     return UnitOfRun(
         unit=o.unit,
@@ -166,6 +169,7 @@ def demo_command(a: argparse.Namespace) -> int:
     if fault := absent(("can", "pymodbus")):
         raise InputError(f"demo: {fault}")
     from triaxcald.demo import run_demo
+    from triaxcald.schema.run import Demo
 
     with Bars() as bars:
         units = run_interruptible(run_demo(a.out, a.seed, bars))
@@ -184,6 +188,8 @@ def demo_command(a: argparse.Namespace) -> int:
 
 
 def _demo_unit(u: DemoUnit) -> UnitOfDemo:
+    from triaxcald.schema.run import UnitOfDemo
+
     cycled = u.after_power_cycle
     return UnitOfDemo(
         **dict(_unit(u.outcome)),

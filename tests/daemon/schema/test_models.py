@@ -14,9 +14,10 @@ import triaxcal as tc
 from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording
 from triaxcald.schema.certificate import Certificate
+from triaxcald.schema.codes import Code, Verdict
 from triaxcald.schema.figures import Residual
 from triaxcald.schema.model import Model, json_schema
-from triaxcald.schema.outcome import Code, Outcome, Verdict
+from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.verification import Verification
 
 RECORDINGS = Path(__file__).parents[3] / "recordings"
