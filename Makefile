@@ -53,6 +53,7 @@ soak: $(TOOLS)  ## a recorder while everything fails at random, 20 minutes; SOAK
 docs: $(SITE)  ## pages and the picture made from the code, the notebook with its outputs, and the site
 	$(BIN)/python docs/reference/python.py
 	$(BIN)/python docs/reference/profile.py
+	$(BIN)/python docs/reference/documents.py
 	$(BIN)/python docs/reference/effects.py
 	$(BIN)/python docs/reference/cli.py
 	$(BIN)/python docs/reference/misbehaving-devices.py

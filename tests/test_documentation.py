@@ -30,6 +30,7 @@ from triaxcal_drivers.catalogue import load_bundle
 from triaxcald.cli.commands import main, parser
 from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording
+from triaxcald.schema.run import Run
 from triaxcald.simulation.bench import DeviceFile, load_device, simulate
 from triaxcald.station.config import StationFile, load_station
 
@@ -351,6 +352,7 @@ def test_the_driver_of_the_examples_is_found_and_decodes(tmp_path: Path) -> None
 from pathlib import Path
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.pipeline import Pipeline
+from triaxcald.schema.run import Run
 from triaxcald.station.config import load_station
 (place,) = load_station(Path("station.toml")).places
 pipeline = Pipeline(place.bundle, "readings")
@@ -488,8 +490,12 @@ NAMED = frozenset(
 EFFECT_LEAVES = {"x", "y", "z"}
 
 
+MODELLED = ("certificate", "outcome", "run")
+"""Pages that are made from the models of documents."""
+
+
 def documented_keys() -> set[str]:
-    text = "".join((PROJECT / f"docs/reference/{page}.md").read_text("utf-8") for page in ("certificate", "outcome"))
+    text = "".join((PROJECT / f"docs/reference/{page}.md").read_text("utf-8") for page in ("documents", *MODELLED))
     return set(re.findall(r"[A-Za-z_0-9]+", " ".join(re.findall(r"`([^`]*)`", text))))
 
 
@@ -522,7 +528,7 @@ def test_every_key_of_a_commands_document_is_explained(
     monkeypatch.chdir(PROJECT)
     assert main([*command.split(), "--json"]) in (0, 1)
     document = json.loads(capsys.readouterr().out)
-    assert document["format"] in (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
+    assert document["format"] in (PROJECT / "docs/reference/documents.md").read_text("utf-8")
     assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
 
 
@@ -536,6 +542,9 @@ def test_every_key_of_the_document_of_a_run_is_explained(tmp_path: Path, capsys:
     assert main(["run", str(station), "--json"]) == 4
     document = json.loads(capsys.readouterr().out)
     assert {"device_state", "records_lost"} <= set(document["units"][0])
+    read = Run.read(document)
+    assert read is not None
+    assert to_text(read.document()) == to_text(document)
     assert keys_of(document, NAMED) - documented_keys() == set()
 
 
@@ -618,6 +627,13 @@ def require_made(pages: Mapping[Path, str]) -> None:
 def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> None:
     made = runpy.run_path(str(PROJECT / "docs/reference/profile.py"))["pages"]()
     assert len(made) == 4
+    require_made(made)
+
+
+def test_the_pages_and_schemas_of_documents_are_those_of_their_models() -> None:
+    names = runpy.run_path(str(PROJECT / "docs/reference/documents.py"))
+    made = names["pages"]()
+    assert len(made) > len(names["MODELS"])
     require_made(made)
 
 

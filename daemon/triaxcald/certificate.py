@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from triaxcald.recording.schema import RawDigest
 from triaxcald.software import drawn_with as drawn_with
 from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
+
+if TYPE_CHECKING:  # the models are loaded when a document is made
+    from triaxcald.schema.certificate import RegistersOfCertificate
 
 DAY_S = 86_400
 TEMPERATURE = "temp_c"
@@ -89,6 +92,15 @@ def certify(
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
+    from triaxcald.schema.certificate import (
+        Certificate,
+        LimitsOfFit,
+        NamedFile,
+        RecordingOfCertificate,
+        Settings,
+        UnitOfCertificate,
+    )
+
     compute_with_one_thread()
     loop = updated = None
     if earlier is None:
@@ -111,34 +123,32 @@ def certify(
             loop, data_quality=quality, output_unit=output_unit, stated=stated, held_by_device=beside
         )
     outside = over_limits(result["after"], station.limits)
-    document: tc.interchange.Document = {
-        "format": "triaxcal.certificate/1",
-        "unit": {
-            "name": unit_name,
-            "vendor": profile.identity.vendor,
-            "product": profile.identity.product,
-            "serial": serial,
-        },
-        "station": {"name": station.name, "sha256": hashlib.sha256(station_text).hexdigest()},
-        "profile": {"name": profile.name, "sha256": bundle.digest()},
-        "recording": {
-            "raw_sha256": digest.hexdigest(),
-            "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
-            "seconds": tc.rounding.number(pipeline.seconds),
-            "poses": len(poses),
-            **pipeline.counts,
-        },
-        "software": dict(computed_with),
-        "settings": {"signs": list(signs), "reference": tc.rounding.number(station.reference)},
-        "limits": {
-            k: tc.rounding.number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v
-        },
-        "verdict": verdict_of(outside, station.limits),
-        "outside": outside,
-        "result": result,
-        "not_written": why_not_written(profile),
-        "registers": _registers_document(image, held, after, poses, stated) if image and held else None,
-    }
+    identity, rounded = profile.identity, tc.rounding.number
+    document = Certificate(
+        format="triaxcal.certificate/1",
+        unit=UnitOfCertificate(name=unit_name, vendor=identity.vendor, product=identity.product, serial=serial),
+        station=NamedFile(name=station.name, sha256=hashlib.sha256(station_text).hexdigest()),
+        profile=NamedFile(name=profile.name, sha256=bundle.digest()),
+        recording=RecordingOfCertificate.model_validate(
+            {
+                "raw_sha256": digest.hexdigest(),
+                "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
+                "seconds": rounded(pipeline.seconds),
+                "poses": len(poses),
+                **pipeline.counts,
+            }
+        ),
+        software=dict(computed_with),
+        settings=Settings.model_validate({"signs": list(signs), "reference": rounded(station.reference)}),
+        limits=LimitsOfFit.model_validate(
+            {name: rounded(limit) for name in LIMITED if (limit := getattr(station.limits, name))}
+        ),
+        verdict=verdict_of(outside, station.limits),
+        outside=outside,
+        result=result,
+        not_written=why_not_written(profile),
+        registers=_registers_part(image, held, after, poses, stated) if image and held else None,
+    ).document()
     return Certified(document, loop, image, not outside, updated)
 
 
@@ -212,39 +222,39 @@ def with_registers(
     coefficients = {w.role: w.value for w in image.words if w.role not in (DATE_ROLE, CRC_ROLE)}
     image = build_image(profile, coefficients | dict(wanted), date_days=int(days))
     poses = [p.pose for p in full.poses]
-    words = _registers_document(image, held, full, poses, station.stated(profile))
-    return replace(certified, image=image, document={**certified.document, "registers": words})
+    registers = _registers_part(image, held, full, poses, station.stated(profile)).document()
+    return replace(certified, image=image, document={**certified.document, "registers": registers})
 
 
-def _registers_document(
+def _registers_part(
     image: RegisterImage, held: HeldByDevice, full: tc.estimate.Calibration, poses: list[tc.Pose], stated: tc.Stated
-) -> tc.interchange.Document:
+) -> RegistersOfCertificate:
+    from triaxcald.schema.certificate import RegistersOfCertificate, RegisterWord
+    from triaxcald.schema.figures import Uncertainty
+
     registers = held.registers.calibration
     in_registers = list(registers.terms)
-    host = [name for name in full.terms if name not in in_registers]
-    return {
-        "terms": in_registers,
-        "left_to_host": host,
-        "holds": registers_hold(registers, full),
-        "rms_g": tc.rounding.error(held.beside_process.residual.rms_g),
-        "cost_rms_g": tc.rounding.error(held.registers.cost),
-        "rounding_rms_g": tc.rounding.error(rounding_cost(image, registers, poses)),
-        "uncertainty": tc.interchange.budget_document(
-            registers,
-            tc.uncertainty.budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost)),
-        ),
-        "words": [
-            {
-                "register": w.register,
-                "role": w.role,
-                "raw": w.raw.hex(),
-                "wanted": tc.rounding.number(w.value),
-                "held": tc.rounding.number(w.held),
-                "unit": w.unit,
-            }
+    budget = tc.uncertainty.budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost))
+    return RegistersOfCertificate(
+        terms=in_registers,
+        left_to_host=[name for name in full.terms if name not in in_registers],
+        holds=registers_hold(registers, full),
+        rms_g=tc.rounding.error(held.beside_process.residual.rms_g),
+        cost_rms_g=tc.rounding.error(held.registers.cost),
+        rounding_rms_g=tc.rounding.error(rounding_cost(image, registers, poses)),
+        uncertainty=Uncertainty.model_validate(tc.interchange.budget_document(registers, budget)),
+        words=[
+            RegisterWord(
+                register=w.register,
+                role=w.role,
+                raw=w.raw.hex(),
+                wanted=tc.rounding.number(w.value),
+                held=tc.rounding.number(w.held),
+                unit=w.unit,
+            )
             for w in image.words
         ],
-    }
+    )
 
 
 def registers_hold(registers: tc.estimate.Calibration, full: tc.estimate.Calibration) -> list[str]:
@@ -291,7 +301,7 @@ def rounding_cost(image: RegisterImage, held: tc.estimate.Calibration, poses: li
     return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))
 
 
-def verdict_of(outside: Sequence[str], limits: Limits) -> str:
+def verdict_of(outside: Sequence[str], limits: Limits) -> Literal["within limits", "outside limits", "not judged"]:
     judged = limits.rms_g is not None or limits.cross_validated_rms_g is not None
     return "outside limits" if outside else "within limits" if judged else "not judged"
 

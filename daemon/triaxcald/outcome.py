@@ -7,83 +7,20 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
-from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
+from triaxcald.schema.codes import Code as Code
+from triaxcald.schema.codes import Verdict as Verdict
 
-FORMAT = "triaxcal.outcome/1"
+if TYPE_CHECKING:  # the models are loaded when a document is made
+    from triaxcald.schema.outcome import Measured, RegistersDone
+
+FORMAT: Final = "triaxcal.outcome/1"
 ATTACHMENT, SUFFIX = "outcome.json", ".outcome.json"
-
-
-class Verdict(StrEnum):
-    PASS = "pass"
-    FAIL = "fail"
-    ABORTED = "aborted"
-    NOT_JUDGED = "not_judged"
-
-
-class Code(StrEnum):
-    """Why the work on a unit ended, for programs. Each code has one verdict and
-    one exit code."""
-
-    WITHIN_LIMITS = "within_limits"
-    NO_LIMIT = "no_limit"
-    NOT_CHECKED = "not_checked"
-    """The device holds a calibration that no check pose has seen."""
-    FIT_OUTSIDE = "fit_outside"
-    CROSS_VALIDATED_OUTSIDE = "cross_validated_outside"
-    VERIFICATION_OUTSIDE = "verification_outside"
-    VERIFICATION_WORSE = "verification_worse"
-    NO_POSES = "no_poses"
-    REFUSED = "refused"
-    IMPLAUSIBLE = "implausible"
-    WRONG_UNIT = "wrong_unit"
-    SERIAL_TWICE = "serial_twice"
-    TWO_ANSWER = "two_answer"
-    """Two units answer at one address."""
-    ABSENT = "absent"
-    LOST = "lost"
-    IN_USE = "in_use"
-    NOT_SETTLED = "not_settled"
-    """The device did not take the calibration, or what it holds is open."""
-    DISK = "disk"
-    MEMORY = "memory"
-    STOPPED = "stopped"
-    INTERNAL = "internal"
-
-    @property
-    def verdict(self) -> Verdict:
-        return _ENDS_WITH[self][0]
-
-    @property
-    def exit_code(self) -> int | None:
-        """None where the process may have died without one."""
-        return _ENDS_WITH[self][1]
-
-
-_ENDS_WITH: Mapping[Code, tuple[Verdict, int | None]] = {
-    Code.WITHIN_LIMITS: (Verdict.PASS, DONE),
-    **dict.fromkeys((Code.NO_LIMIT, Code.NOT_CHECKED), (Verdict.NOT_JUDGED, DONE)),
-    **dict.fromkeys(
-        (Code.FIT_OUTSIDE, Code.CROSS_VALIDATED_OUTSIDE, Code.VERIFICATION_OUTSIDE, Code.VERIFICATION_WORSE),
-        (Verdict.FAIL, OUTSIDE),
-    ),
-    **dict.fromkeys((Code.NO_POSES, Code.REFUSED, Code.IMPLAUSIBLE), (Verdict.ABORTED, REFUSED)),
-    **dict.fromkeys(
-        (
-            Code.WRONG_UNIT, Code.SERIAL_TWICE, Code.TWO_ANSWER, Code.ABSENT, Code.LOST, Code.IN_USE, Code.NOT_SETTLED,
-        ),
-        (Verdict.ABORTED, DEVICE),
-    ),
-    **dict.fromkeys((Code.DISK, Code.MEMORY), (Verdict.ABORTED, DISK)),
-    Code.STOPPED: (Verdict.ABORTED, INTERRUPTED),
-    Code.INTERNAL: (Verdict.ABORTED, None),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,16 +44,17 @@ class Ending:
 
 @dataclass(frozen=True)
 class Papers:
-    """What an ending rests on, as documents, as far as there is any.
+    """What an ending rests on, as far as there is any.
 
-    ``measured`` are figures of the fit; ``digests`` of what was made, by name,
-    None where it was not; ``contents`` the inventory of the recording that the
-    outcome is the last part of.
+    ``measured`` are figures of the fit, ``verification`` the document of the
+    check poses; ``digests`` of what was made, by name, None where it was not;
+    ``contents`` the inventory of the recording that the outcome is the last
+    part of.
     """
 
-    measured: tc.interchange.Document | None = None
+    measured: Measured | None = None
     verification: tc.interchange.Document | None = None
-    registers: tc.interchange.Document | None = None
+    registers: RegistersDone | None = None
     limits: Mapping[str, float | None] = field(default_factory=dict)
     outside: Sequence[str] = ()
     digests: Mapping[str, str | None] = field(default_factory=dict)
@@ -140,58 +78,67 @@ def outcome_document(
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
     needed, ``forced`` the reason for which sanity warnings were overruled."""
-    return {
-        "format": FORMAT,
-        "unit": unit,
-        "serial": serial,
-        "station": station,
-        "ended": ended,
-        "verdict": ending.verdict.value,
-        "code": ending.code.value if ending.code else None,
-        "reason": ending.reason,
-        "exit_code": None if ending.code is Code.INTERNAL else ending.exit_code,
-        "device_state": held.state.value,
-        "evidence": held.evidence.value,
-        "observed": held.observations,
-        "registers": papers.registers,
-        "forced": forced,
-        "journal": journal,
-        "limits": dict(papers.limits),
-        "outside": list(papers.outside),
-        "measured": papers.measured,
-        "verification": papers.verification,
-        "wanted_poses": list(ending.wanted),
-        "supersedes": supersedes,
-        "sha256": dict(papers.digests),
-        "software": dict(software),
-        "contents": papers.contents,
-    }
+    from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Outcome
+    from triaxcald.schema.verification import Verification
+
+    verification, contents = papers.verification, papers.contents
+    return Outcome(
+        format=FORMAT,
+        unit=unit,
+        serial=serial,
+        station=station,
+        ended=ended,
+        verdict=ending.verdict,
+        code=ending.code,
+        reason=ending.reason,
+        exit_code=None if ending.code is Code.INTERNAL else ending.exit_code,
+        device_state=held.state,
+        evidence=held.evidence,
+        observed=held.observations,
+        registers=papers.registers,
+        forced=forced,
+        journal=journal,
+        limits=LimitsOfOutcome.model_validate(papers.limits),
+        outside=list(papers.outside),
+        measured=papers.measured,
+        verification=None if verification is None else Verification.model_validate(verification),
+        wanted_poses=list(ending.wanted),
+        supersedes=supersedes,
+        sha256=dict(papers.digests),
+        software=dict(software),
+        contents=None if contents is None else Contents.model_validate(contents),
+    ).document()
 
 
-def measured_in(certificate: Mapping[str, Any]) -> tc.interchange.Document:
+def measured_in(certificate: Mapping[str, Any]) -> Measured:
     """The figures of the fit, as the certificate has them."""
-    result = certificate["result"]
-    return {
-        "raw_sha256": certificate["recording"]["raw_sha256"],
-        "poses": certificate["recording"]["poses"],
-        "before": result["before"],
-        "after": result["after"],
-        "terms": result["calibration"]["terms"],
-        "left_to_host": (certificate["registers"] or {}).get("left_to_host", []),
-    }
+    from triaxcald.schema.figures import Residual
+    from triaxcald.schema.outcome import Measured
+
+    recording, result = certificate["recording"], certificate["result"]
+    return Measured(
+        raw_sha256=recording["raw_sha256"],
+        poses=recording["poses"],
+        before=Residual.model_validate(result["before"]),
+        after=Residual.model_validate(result["after"]),
+        terms=result["calibration"]["terms"],
+        left_to_host=(certificate["registers"] or {}).get("left_to_host", []),
+    )
 
 
-def registers_told(p: Provisioning) -> tc.interchange.Document:
+def registers_told(p: Provisioning) -> RegistersDone:
     """What was done to the registers, and what an undoing would bring back."""
-    return {
-        "differing": list(p.differing),
-        "written": list(p.written),
-        "marked": list(p.link.probed),
-        "stored": p.stored,
-        "cut_short_before": p.carried,
-        "undoing_failed": p.undoing_failed,
-        "steps": list(p.steps),
-    }
+    from triaxcald.schema.outcome import RegistersDone
+
+    return RegistersDone(
+        differing=list(p.differing),
+        written=list(p.written),
+        marked=list(p.link.probed),
+        stored=p.stored,
+        cut_short_before=p.carried,
+        undoing_failed=p.undoing_failed,
+        steps=list(p.steps),
+    )
 
 
 def digest_of(data: bytes) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -18,7 +18,10 @@ from triaxcald.computer import compute_with_one_thread
 from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.station.guidance import ups
 
-WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
+WITHIN: Final = "within limits"
+OUTSIDE: Final = "outside limits"
+UNJUDGED: Final = "not judged"
+WORSE: Final = "worse than before"
 BY_CHANCE = 0.01
 UNLIKE = 0.05
 """rms error of the magnitude, as a share of the reference, above which another
@@ -154,12 +157,14 @@ def pose_rows(found: Verification, reference: float = 1.0) -> list[tc.interchang
     ]
 
 
-def verdict_by_limit(rms_g: float | None, limit_g: float) -> str:
+def verdict_by_limit(rms_g: float | None, limit_g: float) -> Literal["within limits", "outside limits"]:
     """On the figure as it is printed."""
     return WITHIN if rms_g is not None and rms_g <= limit_g else OUTSIDE
 
 
-def _verdict(before: Verification, after: Verification, limit_g: float | None) -> str:
+def _verdict(
+    before: Verification, after: Verification, limit_g: float | None
+) -> Literal["within limits", "outside limits", "not judged", "worse than before"]:
     if limit_g is not None:
         return verdict_by_limit(tc.rounding.error(after.rms_g), limit_g)
     return WORSE if _is_worse(before, after) else UNJUDGED
@@ -190,22 +195,25 @@ def verification_document(
     """``before``: the device's output with its old registers; ``after``: with
     the new ones, after a restart.
     """
-    rms = after.rms_g
-    document: tc.interchange.Document = {
-        "format": "triaxcal.verification/1",
-        "raw_sha256": raw_sha256,
-        "before_rms_g": tc.rounding.error(before.rms_g),
-        "after_rms_g": tc.rounding.error(rms),
-        "after_max_abs_g": tc.rounding.error(after.max_abs_g),
-        "noise_floor_g": tc.rounding.error(after.noise_floor_g),
-        "limit_rms_g": tc.rounding.number(limit_g),
-        "verdict": _verdict(before, after, limit_g),
-        "poses": pose_rows(after),
-        "data_quality": list(after.data_quality),
-    }
+    from triaxcald.schema.verification import CheckPose  # most commands that verify write no such document
+    from triaxcald.schema.verification import Verification as CheckDocument
+
     angles = apart.angles_deg(after.poses)
-    for row, angle in zip(document["poses"], angles, strict=True):
-        row["from_fit_deg"] = tc.rounding.degrees(float(angle))
-    document["expanded_uncertainty_g"] = tc.rounding.uncertainty(after.expanded_uncertainty_g)
-    document["poses_apart"] = poses_apart(document["poses"], apart.apart_deg)
-    return document
+    rows = [
+        row | {"from_fit_deg": tc.rounding.degrees(float(angle))}
+        for row, angle in zip(pose_rows(after), angles, strict=True)
+    ]
+    return CheckDocument(
+        format="triaxcal.verification/1",
+        raw_sha256=raw_sha256,
+        before_rms_g=tc.rounding.error(before.rms_g),
+        after_rms_g=tc.rounding.error(after.rms_g),
+        after_max_abs_g=tc.rounding.error(after.max_abs_g),
+        noise_floor_g=tc.rounding.error(after.noise_floor_g),
+        limit_rms_g=tc.rounding.number(limit_g),
+        verdict=_verdict(before, after, limit_g),
+        poses=[CheckPose.model_validate(row) for row in rows],
+        data_quality=list(after.data_quality),
+        expanded_uncertainty_g=tc.rounding.uncertainty(after.expanded_uncertainty_g),
+        poses_apart=poses_apart(rows, apart.apart_deg),
+    ).document()

@@ -8,6 +8,9 @@ from typing import Any
 
 import pytest
 
+from triaxcald.documents import to_text
+from triaxcald.schema.run import Demo
+
 
 @pytest.mark.slow
 def test_the_demo_finds_what_is_hidden_and_it_is_gone_after_a_power_cycle(
@@ -15,7 +18,9 @@ def test_the_demo_finds_what_is_hidden_and_it_is_gone_after_a_power_cycle(
 ) -> None:
     done = triaxcal("demo", "--out", tmp_path / "out", "--seed", "1", "--json")
     assert done.code == 0, done.err
-    assert done.json["format"] == "triaxcal.demo/1"
+    read = Demo.read(done.json)
+    assert read is not None
+    assert to_text(read.document()) == to_text(done.json)
     assert [u["unit"] for u in done.json["units"]] == ["can", "modbus"]
     for unit in done.json["units"]:
         assert unit["found"] is True

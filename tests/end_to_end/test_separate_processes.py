@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcald.documents import to_text
 from triaxcald.inputs import measure
+from triaxcald.schema.run import Run
 from triaxcald.simulation.unit import Stored, factory_calibration
 
 UNIT = {
@@ -59,7 +61,9 @@ def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     run = start("run", station, "--json")
     assert run.wait() == 0, run.err
     document = json.loads(run.out)
-    assert document["format"] == "triaxcal.run/1"
+    read = Run.read(document)
+    assert read is not None
+    assert to_text(read.document()) == to_text(document)
     (unit,) = document["units"]
     assert set(unit) == UNIT
     assert (unit["exit_code"], unit["error"], unit["serial"]) == (0, None, "4711")

@@ -29,6 +29,7 @@ from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.unit_run import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
+from triaxcald.schema.outcome import RegistersDone
 from triaxcald.station.config import StationFile, parse_station
 from triaxcald.verification import (
     Apart,
@@ -295,7 +296,7 @@ def outcome_again(
         Papers(
             measured=measured_in(certificate) if certificate else None,
             verification=again.verification if VERIFICATION_FILE in recording.attachments or checked else None,
-            registers=stored.get("registers"),
+            registers=RegistersDone.read(stored.get("registers")),
             limits=again.station.limits.model_dump(),
             outside=certificate["outside"] if certificate else (),
             digests=digests_of,
@@ -306,13 +307,18 @@ def outcome_again(
         station=again.station.name,
         ended=str(stored.get("ended")),
         software={name: named[name] for name in named if name not in DRAWN_WITH},
-        supersedes=stored.get("supersedes"),
-        journal=stored.get("journal"),
-        forced=stored.get("forced"),
+        supersedes=_text_in(stored, "supersedes"),
+        journal=_text_in(stored, "journal"),
+        forced=_text_in(stored, "forced"),
     )
     if not has_codes(stored):
         document = {name: value for name, value in document.items() if name not in ("code", "observed")}
     return document
+
+
+def _text_in(stored: Mapping[str, Any], key: str) -> str | None:
+    value = stored.get(key)
+    return value if isinstance(value, str) else None
 
 
 ABORTED_WITH = (BAD_INPUT, REFUSED, DEVICE, DISK, INTERRUPTED)

@@ -23,6 +23,7 @@ from triaxcald.station.config import check_lines, load_station
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
     from triaxcald.run.unit_run import Outcome
+    from triaxcald.schema.run import UnitOfDemo, UnitOfRun
     from triaxcald.simulation.bench import SimulatedUnit
 
 
@@ -36,12 +37,13 @@ def run_command(a: argparse.Namespace) -> int:
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.unit_run import run_station
+    from triaxcald.schema.run import Run
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
     with showing(worst(outcomes), _told(outcomes)):
         if a.json:
-            emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
+            emit(Run(format="triaxcal.run/1", units=[_unit(o) for o in outcomes]).document())
         else:
             for o in outcomes:
                 if o.error is None:
@@ -63,30 +65,39 @@ def worst(outcomes: Sequence[Outcome]) -> int:
     return severest(o.exit_code for o in outcomes)
 
 
-def _document(o: Outcome) -> dict[str, Any]:
-    result = o.certified.document["result"] if o.certified else None
-    return {
-        "unit": o.unit,
-        "exit_code": o.exit_code,
-        "error": o.error,
-        "wanted_poses": list(o.wanted),
-        "data_quality": list(o.data_quality),
-        "serial": o.certified.document["unit"]["serial"] if o.certified else None,
-        "recording": str(o.recording) if o.recording else None,
-        "certificate": str(o.certificate) if o.certificate else None,
-        "report": str(o.report) if o.report else None,
-        "before": result["before"] if result else None,
-        "after": result["after"] if result else None,
-        "findings": result["findings"] if result else [],
-        "candidates": result["candidates"] if result else [],
-        "choices": result["choices"] if result else [],
-        "registers_written": list(o.provisioned.written) if o.provisioned else [],
-        "device_state": o.device_state,
-        "outcome": o.document,
-        "outcome_file": str(o.outcome) if o.outcome else None,
-        "records_lost": o.lost,
-        "verification": o.verification,
-    }
+def _unit(o: Outcome) -> UnitOfRun:
+    from triaxcald.schema.figures import Residual
+    from triaxcald.schema.outcome import Outcome as OutcomeDocument
+    from triaxcald.schema.run import UnitOfRun
+    from triaxcald.schema.verification import Verification
+
+    result = o.certified.document["result"] if o.certified else {}
+    return UnitOfRun(
+        unit=o.unit,
+        exit_code=o.exit_code,
+        error=o.error,
+        wanted_poses=list(o.wanted),
+        data_quality=list(o.data_quality),
+        serial=o.certified.document["unit"]["serial"] if o.certified else None,
+        recording=_text(o.recording),
+        certificate=_text(o.certificate),
+        report=_text(o.report),
+        before=Residual.model_validate(result["before"]) if result else None,
+        after=Residual.model_validate(result["after"]) if result else None,
+        findings=result.get("findings", []),
+        candidates=result.get("candidates", []),
+        choices=result.get("choices", []),
+        registers_written=list(o.provisioned.written) if o.provisioned else [],
+        device_state=o.device_state,
+        outcome=OutcomeDocument.model_validate(o.document),
+        outcome_file=_text(o.outcome),
+        records_lost=o.lost,
+        verification=None if o.verification is None else Verification.model_validate(o.verification),
+    )
+
+
+def _text(path: Path | None) -> str | None:
+    return str(path) if path else None
 
 
 def say_error(o: Outcome) -> None:
@@ -162,6 +173,7 @@ def demo_command(a: argparse.Namespace) -> int:
     if fault := absent(("can", "pymodbus")):
         raise InputError(f"demo: {fault}")
     from triaxcald.demo import run_demo
+    from triaxcald.schema.run import Demo
 
     with Bars() as bars:
         units = run_interruptible(run_demo(a.out, a.seed, bars))
@@ -170,7 +182,7 @@ def demo_command(a: argparse.Namespace) -> int:
     code = worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
     with showing(code, ""):  # its devices are gone with it
         if a.json:
-            emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
+            emit(Demo(format="triaxcal.demo/1", units=[_demo_unit(u) for u in units]).document())
         else:
             for u in units:
                 if u.outcome.error is None:
@@ -179,15 +191,17 @@ def demo_command(a: argparse.Namespace) -> int:
     return code
 
 
-def _demo_document(u: DemoUnit) -> dict[str, Any]:
+def _demo_unit(u: DemoUnit) -> UnitOfDemo:
+    from triaxcald.schema.run import UnitOfDemo
+
     cycled = u.after_power_cycle
-    return {
-        **_document(u.outcome),
-        "hidden": {name: dict(values) for name, values in u.hidden.items()},
-        "found": u.found,
-        "kept": u.kept,
-        "after_power_cycle_rms_g": tc.rounding.number(cycled.rms_g) if cycled else None,
-    }
+    return UnitOfDemo(
+        **dict(_unit(u.outcome)),
+        hidden={name: dict(values) for name, values in u.hidden.items()},
+        found=u.found,
+        kept=u.kept,
+        after_power_cycle_rms_g=tc.rounding.number(cycled.rms_g) if cycled else None,
+    )
 
 
 def _show_next(folder: Path, units: Sequence[DemoUnit]) -> None:

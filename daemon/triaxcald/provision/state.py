@@ -18,12 +18,13 @@ class DeviceState(StrEnum):
     """All registers read back equal after a restart that removed a probe, or
     after the supply was seen off."""
     NEW_UNVERIFIED = "new_unverified"
-    """The store was acknowledged and the registers read back equal; no restart
-    has proven it."""
+    """The store was acknowledged, or every write lasts, and the registers read
+    back equal; no restart has proven it."""
     MIXED = "mixed"
     """The registers are known to be neither the old ones nor the new ones."""
     UNKNOWN = "unknown"
-    """The link died, or a store went unanswered, and no read decided."""
+    """The link died, or a store went unanswered, and no read decided; or an
+    earlier cut was not settled."""
 
 
 class Observation(StrEnum):
@@ -46,6 +47,7 @@ class Evidence(StrEnum):
     """Evidence for the state of a device."""
 
     NOTHING_WRITTEN = "nothing_written"
+    """No calibration register was written."""
     NOTHING_STORED = "nothing_stored"
     """The registers in use read back equal, and no store was asked for."""
     READ_BACK = "read_back"
@@ -58,6 +60,7 @@ class Evidence(StrEnum):
     """The store went unanswered; the device's counter of stores shows that it
     took place, or did not."""
     NO_ANSWER = "no_answer"
+    """No read decided."""
 
 
 @dataclass
@@ -75,9 +78,9 @@ class Held:
         self.observed.add(observation)
 
     @property
-    def observations(self) -> list[str]:
-        """Values of the observations in the order of `Observation`, for a document."""
-        return [o.value for o in Observation if o in self.observed]
+    def observations(self) -> list[Observation]:
+        """In the order of `Observation`."""
+        return [o for o in Observation if o in self.observed]
 
     @property
     def settled(self) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import PurePath
 
 import numpy as np
@@ -19,6 +19,8 @@ import triaxcal as tc
 from triaxcald.caveats import is_passing
 from triaxcald.report.figures import clean, micro_g, number
 from triaxcald.report.meanings import QUALITY
+from triaxcald.schema.certificate import RegisterWord
+from triaxcald.schema.figures import Residual
 
 # Values of a document, read without trust: what is missing or of the wrong kind
 # counts as missing.
@@ -59,20 +61,6 @@ def words(entry: object) -> str:
 
 
 @dataclass(frozen=True)
-class Residual:
-    """Errors of the magnitude in g, and the probability that pure noise leaves
-    as much."""
-
-    rms_g: float | None = None
-    max_abs_g: float | None = None
-    cross_validated_rms_g: float | None = None
-    noise_floor_g: float | None = None
-    lack_of_fit_p: float | None = None
-    weighted_rms: float | None = None
-    reduced_chi2: float | None = None
-
-
-@dataclass(frozen=True)
 class Stage:
     """A model: its errors and, where known, the residual of every pose in g."""
 
@@ -93,8 +81,15 @@ class HoldOut:
 
 
 def residual_of(value: object) -> Residual | None:
-    known = mapping(value)
-    return Residual(*(number(known.get(field.name)) for field in fields(Residual))) if known else None
+    return residual_in(known) if (known := mapping(value)) else None
+
+
+def residual_in(known: Mapping[str, object]) -> Residual:
+    """A figure that is missing or no number is None."""
+    return Residual(**{name: number(known.get(name)) for name in Residual.model_fields})
+
+
+NO_RESIDUAL = residual_in({})
 
 
 def held_out_of(document: Mapping[str, object]) -> HoldOut | None:
@@ -126,7 +121,7 @@ def stages_of(
         return ()
     held_after_g = held_out.after_rms_g if held_out else None
     if before is None or before == after:
-        return (Stage("This model", after or Residual(), held_after_g, _series(after_g)),)
+        return (Stage("This model", after or NO_RESIDUAL, held_after_g, _series(after_g)),)
     first = Stage("Before", before, held_out.before_rms_g if held_out else None, _series(before_g))
     return (first,) if after is None else (first, Stage("After", after, held_after_g, _series(after_g)))
 
@@ -301,7 +296,7 @@ class Outcome:
 
     @property
     def final(self) -> Residual:
-        return self.stages[-1].residual if self.stages else Residual()
+        return self.stages[-1].residual if self.stages else NO_RESIDUAL
 
     @property
     def small(self) -> tc.units.ErrorUnit:
@@ -564,16 +559,6 @@ def left_out(poses: Sequence[Pose], unit: tc.units.ErrorUnit) -> tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Word:
-    register: str
-    role: str
-    wanted: float | None
-    held: float | None
-    unit: str
-    raw: str
-
-
-@dataclass(frozen=True)
 class Device:
     """Effects: ``held`` are in its registers, for ``host`` it has none,
     ``passing`` depend on how the poses were taken. ``checked`` are errors in g
@@ -588,7 +573,7 @@ class Device:
     rounding_rms_g: float | None
     checked: tuple[tuple[str, float | None], ...]
     checked_verdict: str
-    words: tuple[Word, ...]
+    words: tuple[RegisterWord, ...]
 
 
 def read_device(papers: Mapping[str, object]) -> Device | None:
@@ -632,14 +617,7 @@ def _checked(known: Mapping[str, object]) -> tuple[tuple[str, float | None], ...
     )
 
 
-def _word(entry: Mapping[str, object]) -> Word:
-    names = (str(entry.get(key) or "") for key in ("register", "role"))
-    register, role = names
-    return Word(
-        register,
-        role,
-        number(entry.get("wanted")),
-        number(entry.get("held")),
-        str(entry.get("unit") or ""),
-        str(entry.get("raw") or ""),
-    )
+def _word(entry: Mapping[str, object]) -> RegisterWord:
+    register, role, raw, unit = (clean(entry.get(key) or "") for key in ("register", "role", "raw", "unit"))
+    wanted, held = number(entry.get("wanted")), number(entry.get("held"))
+    return RegisterWord(register=register, role=role, raw=raw, wanted=wanted, held=held, unit=unit)

@@ -11,10 +11,10 @@ import triaxcal as tc
 from triaxcald.caveats import HOST, PROCESS, REGISTERS, none_could_show, unit_questions
 from triaxcald.report.document import (
     CANDIDATE,
+    NO_RESIDUAL,
     Device,
     Finding,
     Outcome,
-    Residual,
     faults_of,
     mapping,
     passes,
@@ -23,6 +23,7 @@ from triaxcald.report.document import (
 )
 from triaxcald.report.figures import chance, micro_g, p_value, ratio
 from triaxcald.report.meanings import told
+from triaxcald.schema.figures import Residual
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
@@ -419,7 +420,7 @@ _Told = tuple[Sequence[str], Sequence[str], Residual]
 
 
 def _read(entry: Mapping[str, object]) -> _Told:
-    return texts(entry.get("corrected_by")), texts(entry.get("terms")), residual_of(entry) or Residual()
+    return texts(entry.get("corrected_by")), texts(entry.get("terms")), residual_of(entry) or NO_RESIDUAL
 
 
 def _reckoned(papers: Mapping[str, object], outcome: Outcome) -> list[_Told]:
@@ -433,7 +434,7 @@ def _reckoned(papers: Mapping[str, object], outcome: Outcome) -> list[_Told]:
     held = texts(known.get("terms"))
     if known and (len(held) > 1 or process or not rows):
         alone = residual_of({"rms_g": known.get("rms_g")}) if set(unit) - set(held) else outcome.final
-        rows.append(([first, *process], held, alone or Residual()))
+        rows.append(([first, *process], held, alone or NO_RESIDUAL))
     if not known or set(unit) - set(held):
         rows.append(([first, HOST, *process] if known else [first, *process], unit, outcome.final))
     return rows

@@ -306,6 +306,9 @@ ROWS = [
     Row("aborted, and no certificate", _aborted, f"{EVENTS}: failed.error: stored null, computed again", True),
     Row("better figures", _better_measured, f"{OUTCOME}: measured.after.rms_g: stored ", True),
     Row("other limits", _outcome(limits={}), f"{OUTCOME}: limits.rms_g: stored nothing", True),
+    Row("a digest that is none", _outcome(supersedes=7), f"{OUTCOME}: supersedes: stored 7, computed again null", True),
+    Row("a reason that is none", _outcome(forced=["x"]), f'{OUTCOME}: forced: stored ["x"], computed again null', True),
+    Row("registers that are none", _registers(steps="all"), f"{OUTCOME}: registers: stored ", True),
     Row("another serial number", _outcome(serial="4712"), f'{OUTCOME}: serial: stored "4712"', True),
     Row(
         "another journal", _outcome(journal="/tmp/x"), f'{OUTCOME}: journal: stored "/tmp/x", computed again null', True

@@ -342,7 +342,7 @@ def test_a_calibration_that_is_none_is_named(
 def test_every_key_of_the_document_is_explained(first: Path, second: Path, triaxcal: Run) -> None:
     backwards = ",".join(SEQUENCE.split(",")[::-1])
     document = triaxcal("frame", first, second, SIGNS, "--faces", SEQUENCE, f"--faces={backwards}", "--json").json
-    text = (Path(__file__).parents[3] / "docs/reference/certificate.md").read_text("utf-8")
+    text = (Path(__file__).parents[3] / "docs/reference/documents.md").read_text("utf-8")
     section = text.partition("## Frame\n")[2].partition("\n## ")[0]
     named = set(re.findall(r"[A-Za-z_0-9]+", " ".join(re.findall(r"`([^`]*)`", section))))
     assert keys(document) - {"format"} <= named

@@ -33,7 +33,7 @@ PLAN = cube_directions()[:14]
 UPS = np.array([v for _, v in PLAN])
 PROJECT = Path(__file__).parents[3]
 RECORDING = PROJECT / "recordings/can-second-order.mcap"
-DOCUMENTED = (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
+DOCUMENTED = (PROJECT / "docs/reference/documents.md").read_text("utf-8")
 
 
 def write(path: Path, t_s: np.ndarray, u: np.ndarray) -> Path:

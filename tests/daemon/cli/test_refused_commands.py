@@ -16,6 +16,7 @@ import pytest
 
 from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
+from triaxcald.outcome import Code, Ending, Papers, outcome_document
 from triaxcald.provision.state import Held
 from triaxcald.run.unit_run import Outcome
 from triaxcald.simulation.unit import Stored, factory_calibration
@@ -214,9 +215,15 @@ def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any,
 def test_a_demo_ends_well_only_if_the_effect_was_found_and_stays_gone_after_a_power_cycle(
     tmp_path: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, found: bool, kept: bool, code: int
 ) -> None:
+    def document(unit: str) -> dict[str, Any]:
+        ending, at = Ending.of(Code.NO_LIMIT, "no limit"), "2026-01-31T12:00:00.000+00:00"
+        return outcome_document(
+            ending, Held(), Papers(), unit=unit, serial=None, station="demo", ended=at, software={}, supersedes=None
+        )
+
     async def done(folder: Path, seed: int, progress: Any) -> list[DemoUnit]:
-        well = DemoUnit({}, Outcome("can", 0, {}, Held()), None, True, True)
-        return [well, DemoUnit({}, Outcome("modbus", 0, {}, Held()), None, found, kept)]
+        well = DemoUnit({}, Outcome("can", 0, document("can"), Held()), None, True, True)
+        return [well, DemoUnit({}, Outcome("modbus", 0, document("modbus"), Held()), None, found, kept)]
 
     monkeypatch.setattr("triaxcald.demo.run_demo", done)
     shown = triaxcal("demo", "--out", tmp_path, "--json")

@@ -254,7 +254,7 @@ class Bench:
             earlier=p.before.raw if p.carried else None,
             after=None if aborted else p.after.raw,
             image=self.image,
-            told=registers_told(p),
+            told=registers_told(p).document(),
             held=p.held,
             forced=True,
             aborted=aborted,

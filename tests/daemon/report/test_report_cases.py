@@ -457,6 +457,16 @@ def test_damaged_registers_tell_nothing_and_break_nothing(damage: object) -> Non
     assert device is None or not any(word.raw for word in device.words)
 
 
+@pytest.mark.parametrize("damage", ["x", "\ud800", "1e400", [1.0], {}, True, float("nan"), 10**400])
+def test_a_damaged_figure_of_a_register_or_a_residual_counts_as_missing(words: dict[str, Any], damage: Any) -> None:
+    device = read_device({"registers": {"words": [{"register": damage, "wanted": damage, "held": 1.5}]}})
+    assert device is not None
+    assert [(word.wanted, word.held) for word in device.words] == [(None, 1.5)]
+    words["after"] |= {"rms_g": damage}
+    assert read_document(words).final.rms_g is None
+    assert read_document(words).final.max_abs_g is not None
+
+
 @pytest.mark.parametrize("damage", [3, "x", {"temp_c": None}, {"temp_c": "warm"}])
 def test_a_channel_that_a_pose_lacks_is_not_drawn(loop: dict[str, Any], damage: object) -> None:
     loop["calibration"]["poses"][2]["channels"] = damage

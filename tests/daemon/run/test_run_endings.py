@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.catalogue import BUILT_IN
-from triaxcald.cli.stations import _document, show_outcome, worst
+from triaxcald.cli.stations import _unit, show_outcome, worst
 from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -156,7 +156,7 @@ async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(
         outcome = await _outcome(workshop, served, limits={"verification_rms_g": 1e-9})
         _holds_old(served)
     assert worst([outcome]) == 1
-    document = _document(outcome)
+    document = _unit(outcome).document()
     assert (document["exit_code"], document["outcome"]["device_state"], document["error"]) == (1, "old", None)
     assert document["verification"]["verdict"] == "outside limits"
     capsys.readouterr()
@@ -314,7 +314,7 @@ async def test_what_a_run_loses_between_bus_and_disk_is_in_its_table_and_its_doc
     with Recording.open(outcome.recording) as recording:
         lost = sum(loss.records for loss in recording.losses())
     assert lost > 0
-    assert _document(outcome)["records_lost"] == outcome.lost == lost
+    assert _unit(outcome).document()["records_lost"] == outcome.lost == lost
     capsys.readouterr()
     show_outcome(outcome)
     assert f"  {lost} records were lost between bus and disk\n" in capsys.readouterr().out

@@ -1,0 +1,122 @@
+"""The certificate of a unit (`triaxcal.certificate/1`)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from triaxcald.schema.figures import Uncertainty
+from triaxcald.schema.model import Figure, Model, Sha256
+
+Sign = Literal[-1, 1]
+
+
+class UnitOfCertificate(Model):
+    name: Annotated[str, Field(description="name in the station file")]
+    vendor: Annotated[str, Field(description="vendor, by the profile")]
+    product: Annotated[str, Field(description="product, by the profile")]
+    serial: Annotated[str | None, Field(description="serial number; `null` without one")]
+
+
+class NamedFile(Model):
+    name: Annotated[str, Field(description="its name")]
+    sha256: Annotated[Sha256, Field(description="digest of its bytes; of a profile, with the files that it names")]
+
+
+class RecordingOfCertificate(Model):
+    raw_sha256: Annotated[
+        Sha256,
+        Field(description="[digest](recording.md#metadata-and-attachments) of the raw records of the calibration"),
+    ]
+    started: Annotated[str, Field(description="host's time of the first record, UTC, ISO 8601")]
+    seconds: Annotated[Figure, Field(description="duration [s]")]
+    poses: Annotated[int, Field(description="number of still poses")]
+    samples: Annotated[int, Field(description="number of samples that came")]
+    missing: Annotated[int, Field(description="number of samples that did not come")]
+    duplicates: Annotated[int, Field(description="number of samples that came again")]
+    incomplete: Annotated[int, Field(description="number of samples of which a part did not come")]
+    errors: Annotated[int, Field(description="number of errors of the bus")]
+    out_of_order: Annotated[int, Field(description="number of samples that were earlier than one before")]
+    receiver_overflows: Annotated[int, Field(description="number of records that came after a loss in the receiver")]
+    malformed: Annotated[int, Field(description="number of records that are not as the profile has them, if any")] = 0
+    invalid: Annotated[int, Field(description="number of samples that the unit called invalid, if any")] = 0
+    not_finite: Annotated[int, Field(description="number of samples whose outputs are no finite numbers, if any")] = 0
+
+
+class Settings(Model):
+    signs: Annotated[list[Sign], Field(description="signs of the scale factors of x, y, z")]
+    reference: Annotated[Figure, Field(description="magnitude of the reference vector [g]")]
+
+
+class LimitsOfFit(Model):
+    rms_g: Annotated[Figure | None, Field(description="limit of the residual, rms [g]; absent without one")] = None
+    cross_validated_rms_g: Annotated[
+        Figure | None, Field(description="limit of the cross-validated rms [g]; absent without one")
+    ] = None
+
+
+class RegisterWord(Model):
+    register_: str = Field(alias="register", description="name of the register in the profile")
+    role: Annotated[str, Field(description="what it is to a calibration: `scale_factor.x`, `bias.y`, …")]
+    raw: Annotated[str, Field(description="its bytes, hexadecimal")]
+    wanted: Annotated[Figure | None, Field(description="value as computed [`unit`]")]
+    held: Annotated[Figure | None, Field(description="value as the register holds it [`unit`]")]
+    unit: Annotated[str, Field(description="unit of the values")]
+
+
+class RegistersOfCertificate(Model):
+    terms: Annotated[list[str], Field(description="`linear`, and the effects that the registers correct")]
+    left_to_host: Annotated[list[str], Field(description="effects that the device has no registers for")]
+    holds: Annotated[
+        list[str], Field(description="conditions under which the linear part is all of a reading, in words")
+    ]
+    rms_g: Annotated[Figure | None, Field(description="rms residual under the registers, in the poses [g]")]
+    cost_rms_g: Annotated[
+        Figure | None,
+        Field(description="rms difference of |a| from the whole correction, over the sphere [g]"),
+    ]
+    rounding_rms_g: Annotated[
+        Figure | None, Field(description="rms change of |a| in the poses by rounding to the registers [g]")
+    ]
+    uncertainty: Annotated[
+        Uncertainty,
+        Field(description="[uncertainty](../explanation/uncertainty.md) of the calibration in the registers"),
+    ]
+    words: Annotated[list[RegisterWord], Field(description="the registers, in the order of the profile")]
+
+
+class Certificate(Model):
+    """Everything that follows from a recording, its profile and its station
+    file, and nothing else."""
+
+    format: Annotated[Literal["triaxcal.certificate/1"], Field(description="format of this document")]
+    unit: Annotated[UnitOfCertificate, Field(description="the unit")]
+    station: Annotated[NamedFile, Field(description="the station, and its file")]
+    profile: Annotated[NamedFile, Field(description="the profile, and its files")]
+    recording: Annotated[RecordingOfCertificate, Field(description="the recording: what came and what was lost")]
+    software: Annotated[
+        dict[str, str],
+        Field(description="versions of `triaxcal`, `numpy`, `scipy`, `python`; `processor`, `blas`, `blas_kernel`"),
+    ]
+    settings: Annotated[Settings, Field(description="settings of the calibration")]
+    limits: Annotated[LimitsOfFit, Field(description="limits of the station")]
+    verdict: Annotated[
+        Literal["within limits", "outside limits", "not judged"],
+        Field(description="on the fit: `within limits`, `outside limits`, `not judged` (no limit)"),
+    ]
+    outside: Annotated[list[str], Field(description="figures that are outside their limits, in words")]
+    result: Annotated[
+        dict[str, Any],
+        Field(
+            description="the [`triaxcal.loop/1`](documents.md#loop), "
+            "or after `--rezero` the [`triaxcal.rezero/1`](documents.md#biases-anew)"
+        ),
+    ]
+    not_written: Annotated[
+        str | None, Field(description="linear parameters without a register, in words; `null` if all have one")
+    ]
+    registers: Annotated[
+        RegistersOfCertificate | None,
+        Field(description="content of the registers; `null` if the device cannot take a calibration"),
+    ]

@@ -1,0 +1,185 @@
+"""Writes the pages and the JSON Schemas of the documents from their models: `python docs/reference/documents.py`."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+from collections.abc import Iterator
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from triaxcald.provision.state import DeviceState, Evidence, Observation
+from triaxcald.schema.certificate import Certificate
+from triaxcald.schema.codes import Code, Verdict
+from triaxcald.schema.model import Model, json_schema
+from triaxcald.schema.outcome import Outcome
+from triaxcald.schema.run import Demo, Run
+from triaxcald.schema.verification import Verification
+
+HERE = Path(__file__).parent
+MODELS: dict[str, type[Model]] = {
+    "certificate": Certificate,
+    "verification": Verification,
+    "outcome": Outcome,
+    "run": Run,
+    "demo": Demo,
+}
+JSON_TYPES = {
+    "string": "text",
+    "number": "number",
+    "integer": "integer",
+    "boolean": "boolean",
+    "null": "`null`",
+    "object": "object",
+}
+CERTIFICATE = """# Certificate
+
+`triaxcal run` and `demo` write `triaxcal.certificate/1` for each unit that did not fail: a file, and an attachment of the recording. It has no time of issue and no signature: an audit computes the same bytes. Rounding, `null` and units are those of [all documents](documents.md).
+
+Made from the models in `daemon/triaxcald/schema/` by `docs/reference/documents.py`; JSON Schema of the [certificate](certificate.schema.json) and the [verification](verification.schema.json).
+
+"""  # noqa: E501
+VERIFICATION = """
+## Verification
+
+`triaxcal.verification/1`, an attachment of the recording: the magnitude that the device itself reports, in other attitudes than the fit's.
+
+"""  # noqa: E501
+OUTCOME = """# Outcome
+
+`triaxcal run`, `provision` and `restore` end with one document, `triaxcal.outcome/1`. It says what became of the unit and what the device holds. A recording has it as its last attachment, `outcome.json`; the same bytes lie beside it as `UNIT-SERIAL-TIME.outcome.json`. `provision` and `restore` write `SERIAL-TIME.outcome.json` into the station's folder. With `--json` it stands under `units[].outcome` of `triaxcal.run/1` and under `outcome` of `triaxcal.provisioning/1` and `triaxcal.restoration/1`, with its path in `outcome_file`. An outcome is never edited: a rework writes another that names this one. If the device was not reached, or its registers were not read, there is no file. After a third signal there is none, and standard error says what the device holds.
+
+Made from the model in `daemon/triaxcald/schema/outcome.py` by `docs/reference/documents.py`; [JSON Schema](outcome.schema.json).
+
+"""  # noqa: E501
+MARK = """
+A mark is a value in use that is stored nowhere ([0012](../decisions/0012-every-write-can-be-undone.md)). If the state is open, the last line of the command names the one that settles it.
+
+"""  # noqa: E501
+RUN = """# Run and demo
+
+`triaxcal run --json` prints `triaxcal.run/1`, `demo --json` prints `triaxcal.demo/1`.
+
+Made from the models in `daemon/triaxcald/schema/run.py` by `docs/reference/documents.py`; JSON Schema of a [run](run.schema.json) and a [demo](demo.schema.json).
+
+"""  # noqa: E501
+DEMO = """
+## Demo
+
+The units are simulated ones. Besides the keys of a run:
+
+"""
+JOURNAL = """
+## Journal
+
+Before the first write the journal is on the disk, with what the device held and is to hold: `journal/PRODUCT-SERIAL.json` in the station's folder, or `journal/SLOT-RUN.json` without a serial number (characters outside `A–Z a–z 0–9 . _ -` become `_`). It goes once the device is settled. [`provision --resume`](../how-to/provision-registers.md#after-a-cut) and `restore` go by it; they also find `journal/SERIAL.json` of an earlier version.
+"""  # noqa: E501
+
+
+def pages() -> dict[Path, str]:
+    """The text of each page by its path."""
+    made = {HERE / f"{name}.schema.json": json_schema(model) for name, model in MODELS.items()}
+    certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
+    of_a_run = set(_keys(Run).splitlines())
+    of_a_demo = [row for row in _keys(Demo).splitlines() if row not in of_a_run]
+    run = RUN + _keys(Run) + DEMO + "\n".join([*_keys(Run).splitlines()[:2], *of_a_demo]) + "\n"
+    texts = {"certificate": certificate, "outcome": _outcome(), "run": run}
+    return made | {HERE / f"{name}.md": text for name, text in texts.items()}
+
+
+def _outcome() -> str:
+    codes = [
+        (f"`{code}`", f"`{code.verdict}`", f"`{json.dumps(code.exit_code)}`", meaning)
+        for code, meaning in _meanings(Code)
+    ]
+    return "".join(
+        [
+            OUTCOME,
+            _keys(Outcome),
+            "\n## Verdict and code\n\n",
+            _words("verdict", Verdict),
+            "\nA code has one verdict and one exit code.\n\n",
+            _table(("code", "verdict", "exit code", "meaning"), codes),
+            "\n## Device state\n\n",
+            _words("device state", DeviceState),
+            MARK,
+            _words("evidence", Evidence),
+            "\n",
+            _words("observation", Observation),
+            JOURNAL,
+        ]
+    )
+
+
+# Tables
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (head, ("---",) * len(head), *rows))
+
+
+def _words(title: str, of: type[StrEnum]) -> str:
+    return _table((title, "meaning"), [(f"`{member}`", meaning) for member, meaning in _meanings(of)])
+
+
+def _meanings(of: Any) -> Iterator[tuple[Any, str]]:
+    """The members of an enumeration, each with the docstring that follows it."""
+    (body,) = (node.body for node in ast.parse(inspect.getsource(of)).body if isinstance(node, ast.ClassDef))
+    for member, text in pairwise(body):
+        if isinstance(member, ast.Assign) and isinstance(member.targets[0], ast.Name):
+            assert isinstance(text, ast.Expr), f"{member.targets[0].id} has no docstring"
+            yield of[member.targets[0].id], " ".join(str(ast.literal_eval(text.value)).split()).rstrip(".")
+
+
+def _keys(model: type[Model]) -> str:
+    """A row for each key of a document, those of the objects in it below them."""
+    schema = model.model_json_schema()
+    return _table(("key", "type", "meaning"), list(_rows(schema, schema.get("$defs", {}), "", {})))
+
+
+def _rows(
+    node: dict[str, Any], named: dict[str, Any], prefix: str, shown: dict[str, str]
+) -> Iterator[tuple[str, str, str]]:
+    """``shown`` are models with the key under which the page has their keys
+    already. A model with a ``format`` is a document with keys of its own."""
+    for name, of in node["properties"].items():
+        key = f"{prefix}{name}"
+        inner, suffix = _model_in(of, named), "[]." if "list" in _type(of, named) else "."
+        known = inner and shown.get(inner)
+        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), of["description"].replace("|", r"\|")
+        if inner and not known and "format" not in named[inner]["properties"]:
+            shown[inner] = key
+            yield from _rows(named[inner], named, f"{key}{suffix}", shown)
+
+
+def _model_in(of: dict[str, Any], named: dict[str, Any]) -> str | None:
+    """The name of the model of an object, of one that may be null, or of the
+    objects of a list."""
+    if isinstance(reference := of.get("$ref"), str):
+        name = reference.rpartition("/")[2]
+        return name if "properties" in named[name] else None
+    inner = [*of.get("anyOf", ()), *([of["items"]] if isinstance(of.get("items"), dict) else [])]
+    return next((name for each in inner if (name := _model_in(each, named))), None)
+
+
+def _type(of: dict[str, Any], named: dict[str, Any]) -> str:
+    if "anyOf" in of:
+        return " or ".join(_type(each, named) for each in of["anyOf"])
+    if isinstance(reference := of.get("$ref"), str):
+        return _type(named[reference.rpartition("/")[2]], named)
+    if "const" in of:
+        return f"`{of['const']}`"
+    if of.get("type") == "array":
+        each = _type(of["items"], named)
+        return f"list of ({each})" if " " in each else f"list of {each}"
+    if isinstance(each := of.get("additionalProperties"), dict):
+        return f"by name: {_type(each, named)}"
+    return JSON_TYPES[of["type"]]
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
