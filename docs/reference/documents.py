@@ -56,7 +56,7 @@ Made from the model in `daemon/triaxcald/schema/outcome.py` by `docs/reference/d
 
 """  # noqa: E501
 MARK = """
-A mark is a value in use that is stored nowhere ([0012](../decisions/0012-every-write-can-be-undone.md)). If the state is open, the last line of the command names the one that settles it.
+A probe is a value in use that is stored nowhere ([0012](../decisions/0012-every-write-can-be-undone.md)). If the state is open, the last line of the command names the one that settles it.
 
 """  # noqa: E501
 RUN = """# Run and demo

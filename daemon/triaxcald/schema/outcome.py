@@ -20,7 +20,7 @@ class RegistersDone(Model):
         list[str],
         Field(
             default_factory=list,
-            description="registers that got a mark, a value that is in use and stored nowhere",
+            description="registers that got a probe, a value that is in use and stored nowhere",
         ),
     ]
     stored: Annotated[bool, Field(description="whether the calibration is stored, as far as the device says")]
