@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.interface import SampleBlock
-from triaxcal_drivers.profile import READINGS
+import triaxcal_drivers as td
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
 from triaxcald.recording.export import Rows
@@ -76,7 +75,7 @@ def applied(
             )
         pieces = iter([(samples.time_ns * 1e-9, samples.channels)])
         blocks = (
-            SampleBlock(
+            td.SampleBlock(
                 samples.time_ns[at : at + BLOCK],
                 np.arange(at, min(at + BLOCK, len(samples.time_ns))),
                 samples.readings[at : at + BLOCK],
@@ -143,8 +142,8 @@ def _of_another_unit(calibration: tc.Calibration, name: str, lengths: list[float
     ]
 
 
-def _of_recording(path: Path, phase: Phase) -> Iterator[SampleBlock]:
+def _of_recording(path: Path, phase: Phase) -> Iterator[td.SampleBlock]:
     with open_recording(path) as recording:
-        stream = DecodedStream(bundle_of(recording), READINGS)
+        stream = DecodedStream(bundle_of(recording), td.READINGS)
         for batch in recording.raw(phase):
             yield stream.rising(batch)

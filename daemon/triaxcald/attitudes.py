@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.files import read_whole
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 
 VECTOR, TIMES, LABEL = ("x", "y", "z"), ("start_s", "end_s"), "label"
@@ -40,7 +40,7 @@ def read_attitudes(path: str) -> list[Row]:
     expected.
     """
     try:
-        text = read_whole(Path(path), TABLE_MOST, pipe=True).decode("utf-8-sig")
+        text = td.files.read_whole(Path(path), TABLE_MOST, pipe=True).decode("utf-8-sig")
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror}") from e
     except UnicodeDecodeError as e:

@@ -17,17 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.profile import Bundle, Profile
-from triaxcal_drivers.roles import (
-    AXES,
-    CRC_ROLE,
-    DATE_ROLE,
-    LINEAR,
-    LINEAR_ROLES,
-    MISALIGNMENT,
-    REFERENCE_ROLE,
-    SCALE_FACTOR,
-)
+import triaxcal_drivers as td
 from triaxcald.caveats import is_passing
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
@@ -73,7 +63,7 @@ class Certified:
 
 
 def certify(
-    bundle: Bundle,
+    bundle: td.Bundle,
     station: StationFile,
     station_text: bytes,
     pipeline: Pipeline,
@@ -156,20 +146,20 @@ def roles(sensor: tc.Sensor, channel_reference: Mapping[str, float]) -> dict[str
     """A sensor's coefficients by register role."""
     out = {
         f"{name}.{axis}": float(values[i])
-        for name, values in zip(LINEAR, (sensor.scale_factor, sensor.misalignment, sensor.bias), strict=True)
-        for i, axis in enumerate(AXES)
+        for name, values in zip(td.roles.LINEAR, (sensor.scale_factor, sensor.misalignment, sensor.bias), strict=True)
+        for i, axis in enumerate(td.roles.AXES)
     }
     for effect, values in sensor.effects:
         out |= {f"{effect.name}.{c.name}": float(v) for c, v in zip(effect.coefficients, values, strict=True)}
     if TEMPERATURE in channel_reference:
-        out[REFERENCE_ROLE] = channel_reference[TEMPERATURE]
+        out[td.roles.REFERENCE_ROLE] = channel_reference[TEMPERATURE]
     return out
 
 
-def why_not_written(profile: Profile) -> str | None:
+def why_not_written(profile: td.Profile) -> str | None:
     """Why a device cannot take a calibration at all: without one of the nine,
     the other eight would be wrong."""
-    missing = [role for role in LINEAR_ROLES if profile.by_role(role) is None]
+    missing = [role for role in td.roles.LINEAR_ROLES if profile.by_role(role) is None]
     return f"the device has no register for {', '.join(missing)}" if missing else None
 
 
@@ -185,7 +175,7 @@ class HeldByDevice:
 
 
 def held_by_device(
-    profile: Profile, full: tc.estimate.Calibration, logged: Mapping[str, tc.Floats] | None = None
+    profile: td.Profile, full: tc.estimate.Calibration, logged: Mapping[str, tc.Floats] | None = None
 ) -> HeldByDevice | None:
     """None where the device cannot take a calibration at all. ``logged`` as
     `triaxcal.estimate.projected_calibration.reduced` has it."""
@@ -199,7 +189,7 @@ def held_by_device(
     return HeldByDevice(tc.estimate.reduced(full, has, logged), beside)
 
 
-def image_of(profile: Profile, registers: tc.estimate.Calibration, date_days: int) -> RegisterImage:
+def image_of(profile: td.Profile, registers: tc.estimate.Calibration, date_days: int) -> RegisterImage:
     """Of the coefficients as they are printed, so that the words follow from
     the document. Raises RegisterValueError where a value does not go into its
     register."""
@@ -210,7 +200,7 @@ def image_of(profile: Profile, registers: tc.estimate.Calibration, date_days: in
 
 
 def with_registers(
-    certified: Certified, bundle: Bundle, station: StationFile, wanted: Mapping[str, float]
+    certified: Certified, bundle: td.Bundle, station: StationFile, wanted: Mapping[str, float]
 ) -> Certified:
     """With the registers for other coefficients, ``wanted`` by role, than were
     computed: those of a stored certificate that says the same."""
@@ -218,8 +208,8 @@ def with_registers(
     held = held_by_device(profile, full)
     if image is None or held is None:
         return certified
-    days = next((w.value for w in image.words if w.role == DATE_ROLE), 0)
-    coefficients = {w.role: w.value for w in image.words if w.role not in (DATE_ROLE, CRC_ROLE)}
+    days = next((w.value for w in image.words if w.role == td.roles.DATE_ROLE), 0)
+    coefficients = {w.role: w.value for w in image.words if w.role not in (td.roles.DATE_ROLE, td.roles.CRC_ROLE)}
     image = build_image(profile, coefficients | dict(wanted), date_days=int(days))
     poses = [p.pose for p in full.poses]
     registers = _registers_part(image, held, full, poses, station.stated(profile)).document()
@@ -283,8 +273,8 @@ def rounding_cost(image: RegisterImage, held: tc.estimate.Calibration, poses: li
         return np.array([rounded.get(f"{effect.name}.{c.name}", float(v)) for c, v in pairs])
 
     worse = tc.Sensor(
-        triple(SCALE_FACTOR, sensor.scale_factor),
-        triple(MISALIGNMENT, sensor.misalignment),
+        triple(td.roles.SCALE_FACTOR, sensor.scale_factor),
+        triple(td.roles.MISALIGNMENT, sensor.misalignment),
         triple("bias", sensor.bias),
         tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
     )
@@ -294,8 +284,8 @@ def rounding_cost(image: RegisterImage, held: tc.estimate.Calibration, poses: li
     )
     reference = dict(held.channel_reference)
     covariates = {n: channels[n] - v for n, v in reference.items()}
-    if TEMPERATURE in reference and REFERENCE_ROLE in rounded:
-        reference[TEMPERATURE] = rounded[REFERENCE_ROLE]
+    if TEMPERATURE in reference and td.roles.REFERENCE_ROLE in rounded:
+        reference[TEMPERATURE] = rounded[td.roles.REFERENCE_ROLE]
     shifted = {n: channels[n] - v for n, v in reference.items()}
     exact = np.linalg.norm(sensor.specific_force(u, covariates), axis=1)
     return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))

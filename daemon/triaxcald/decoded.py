@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.profile import Bundle
+import triaxcal_drivers as td
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
 _PASSED_ON = ("missing", "duplicates", "incomplete", "errors")
@@ -30,7 +28,7 @@ _CALLED = {
 }
 
 
-def only_finite(block: SampleBlock) -> SampleBlock:
+def only_finite(block: td.SampleBlock) -> td.SampleBlock:
     """Without the samples that hold no reading: a float register, or a message,
     may hold NaN or rubbish."""
     finite = np.asarray((np.abs(block.readings) < tc.poses.READING_MOST).all(axis=1))
@@ -42,12 +40,12 @@ class DecodedStream:
     """One stream of one unit, decoded; counts whatever does not come through.
     It keeps no samples, however many come."""
 
-    bundle: Bundle
+    bundle: td.Bundle
     stream: str
     counts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(COUNTS, 0)))
 
     def __post_init__(self) -> None:
-        self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
+        self._decoder = td.driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
@@ -81,20 +79,20 @@ class DecodedStream:
         counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = checkpoint
         self.counts = counts.copy()
 
-    def feed(self, batch: RawBatch) -> SampleBlock:
+    def feed(self, batch: td.RawBatch) -> td.SampleBlock:
         """Takes raw records; gives the samples that they complete."""
         return self._decoded(batch)[0]
 
-    def rising(self, batch: RawBatch) -> SampleBlock:
+    def rising(self, batch: td.RawBatch) -> td.SampleBlock:
         """The same without those that are out of order."""
         block, fresh = self._decoded(batch)
         return block if fresh.all() else block.only(fresh)
 
-    def _decoded(self, batch: RawBatch) -> tuple[SampleBlock, NDArray[np.bool_]]:
+    def _decoded(self, batch: td.RawBatch) -> tuple[td.SampleBlock, NDArray[np.bool_]]:
         """The samples, and which of them go on in time."""
         if self._first_host_ns is None and len(batch):
             self._first_host_ns = int(batch.time_ns[0])
-        self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE))
+        self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & td.RawFlag.LOST_BEFORE))
         block = only_finite(self._decoder.feed(batch))
         self.two_senders = self.two_senders or block.two_senders
         for name in _PASSED_ON:
@@ -116,7 +114,7 @@ class DecodedStream:
             self._take(block, fresh)
         return block, fresh
 
-    def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
+    def _take(self, block: td.SampleBlock, fresh: NDArray[np.bool_]) -> None:
         """The block's samples, of which those that are ``fresh`` go on in
         time."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.profile import READINGS
+import triaxcal_drivers as td
 from triaxcald.inputs import document_bytes, parse_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.config import Place, Station
@@ -98,7 +98,7 @@ class EarlierFile:
             reference_unit="g",
             output_unit=place.bundle.profile.output.unit,
         )
-        sent = getattr(place.bundle.profile.streams[READINGS], "channels", None)
+        sent = getattr(place.bundle.profile.streams[td.READINGS], "channels", None)
         needed = [
             tc.effects.channel_of(n) for n in self.calibration.fitted.channel_reference if not tc.effects.is_derived(n)
         ]

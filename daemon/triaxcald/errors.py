@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import ClassVar
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError, DriverMissing, LogError, ProfileError, RegisterValueError
+import triaxcal_drivers as td
 from triaxcald.memory import ran_out_of_memory
 
 
@@ -92,9 +92,9 @@ def exit_code_of(e: BaseException) -> int:
     import asyncio  # 30 ms, which the start of a command does without
 
     match e:
-        case tc.Refused() | RegisterValueError():
+        case tc.Refused() | td.RegisterValueError():
             return REFUSED
-        case tc.InvalidData() | ProfileError() | DriverMissing() | LogError():
+        case tc.InvalidData() | td.ProfileError() | td.DriverMissing() | td.LogError():
             return BAD_INPUT
         case DaemonError():
             return e.exit_code
@@ -102,5 +102,5 @@ def exit_code_of(e: BaseException) -> int:
             return REFUSED
         case asyncio.CancelledError() | KeyboardInterrupt():
             return INTERRUPTED
-        case DriverError() | _:
+        case td.DriverError() | _:
             return DEVICE

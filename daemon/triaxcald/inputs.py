@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.catalogue import parse_bundle
-from triaxcal_drivers.files import TooLarge, read_whole, special_kind
-from triaxcal_drivers.hints import clipped
-from triaxcal_drivers.profile import READINGS, Bundle, Profile
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.errors import InputError, RecordingError
@@ -57,7 +54,7 @@ class Measured:
     poses: list[tc.Pose]
     windows: tc.poses.Windows | None
     data_quality: list[str]
-    profile: Profile | None = None
+    profile: td.Profile | None = None
     signs: tuple[int, int, int] | None = None
     reference: float | None = None
     unit: Mapping[str, str] | None = None
@@ -74,7 +71,7 @@ def measure(
     name: str,
     *,
     phase: Phase = CALIBRATION,
-    stream: str = READINGS,
+    stream: str = td.READINGS,
     moments: tc.inputs.Moments | None = None,
     reading: Reading | None = None,
     turn_s: float | None = None,
@@ -259,7 +256,7 @@ def samples_of(recording: Contents, phases: Iterable[str]) -> dict[str, dict[str
     return found
 
 
-def bundle_of(recording: Contents) -> Bundle:
+def bundle_of(recording: Contents) -> td.Bundle:
     """The profile that a recording carries. Raises RecordingError."""
     require_of_unit(recording)
     try:
@@ -267,7 +264,7 @@ def bundle_of(recording: Contents) -> Bundle:
     except KeyError:
         raise RecordingError(f"{recording.name}: attachment {PROFILE}: missing; not a recording of a station") from None
     files = {n.removeprefix("profile/"): d for n, d in recording.attachments.items() if n.startswith("profile/")}
-    return parse_bundle(text, files, where=f"{recording.name}: {PROFILE}")
+    return td.parse_bundle(text, files, where=f"{recording.name}: {PROFILE}")
 
 
 def read_document(path: str) -> Mapping[str, Any]:
@@ -278,8 +275,8 @@ def read_document(path: str) -> Mapping[str, Any]:
 def document_bytes(path: str) -> bytes:
     """Of the file that is to be a JSON document. Raises InputError."""
     try:
-        return read_whole(Path(path), DOCUMENT_MOST, pipe=True)
-    except TooLarge as e:
+        return td.files.read_whole(Path(path), DOCUMENT_MOST, pipe=True)
+    except td.files.TooLarge as e:
         _require_no_other_kind(e.head, path)
         raise InputError(f"{path}: {e.strerror}") from e
     except OSError as e:
@@ -287,7 +284,7 @@ def document_bytes(path: str) -> bytes:
 
 
 def _require_no_other_kind(data: bytes, where: str) -> None:
-    if known := special_kind(data, json=False):
+    if known := td.files.special_kind(data, json=False):
         raise InputError(f"{where}: {known}, expected a JSON document, such as a calibration")
 
 
@@ -322,5 +319,5 @@ def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     held = dict(pairs)
     if len(held) < len(pairs):
         twice = next(k for k, count in Counter(k for k, _ in pairs).items() if count > 1)
-        raise ValueError(f"the key '{clipped(twice)}' is given twice")
+        raise ValueError(f"the key '{td.hints.clipped(twice)}' is given twice")
     return held

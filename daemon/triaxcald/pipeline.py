@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO
+import triaxcal_drivers as td
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
 
 __all__ = ["DecodedStream", "Pipeline", "beside_samples", "of_poses", "only_finite", "together"]
@@ -28,11 +27,11 @@ class Pipeline(DecodedStream):
         super().__post_init__()
         self._finder = tc.poses.PoseFinder(self.turn_s)
 
-    def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
+    def _take(self, block: td.SampleBlock, fresh: NDArray[np.bool_]) -> None:
         channels = {n: v[fresh] for n, v in block.channels.items()}
         self._finder.feed(block.time_ns[fresh], block.readings[fresh], channels)
 
-    def feed_all(self, batches: Iterable[RawBatch]) -> Pipeline:
+    def feed_all(self, batches: Iterable[td.RawBatch]) -> Pipeline:
         for batch in batches:
             self.feed(batch)
         return self
@@ -101,7 +100,7 @@ class Pipeline(DecodedStream):
 
     @property
     def output_unit(self) -> str:
-        return self.bundle.profile.output.unit if self.stream == READINGS else "g"
+        return self.bundle.profile.output.unit if self.stream == td.READINGS else "g"
 
     def _implausible(self) -> str:
         """Where still readings span more than gravity does, by the nominal
@@ -110,11 +109,11 @@ class Pipeline(DecodedStream):
         nominal = self.bundle.profile.output.nominal_scale_factor
         windows = self.windows
         spans = self._finder.spans()
-        if windows is None or not spans or nominal is None or self.stream != READINGS:
+        if windows is None or not spans or nominal is None or self.stream != td.READINGS:
             return ""
         means = np.array([windows.mean[s.used].mean(axis=0) for s in spans])
         half_g = np.ptp(means, axis=0) / 2 / np.abs(nominal)
-        if half_g.max() <= SCALE_FACTOR_RATIO:
+        if half_g.max() <= td.SCALE_FACTOR_RATIO:
             return ""
         axis = int(np.argmax(half_g))
         return (

@@ -13,6 +13,7 @@ from types import ModuleType
 import pytest
 
 import triaxcal
+import triaxcal_drivers
 
 ROOT = Path(__file__).parents[2]
 
@@ -81,16 +82,17 @@ def test_no_contract_between_the_houses_is_broken() -> None:
     assert "0 broken" in done.stdout
 
 
-def test_the_daemon_takes_public_names_of_the_metrology_alone() -> None:
+@pytest.mark.parametrize(("alias", "house"), [("tc", triaxcal), ("td", triaxcal_drivers)])
+def test_the_daemon_takes_public_names_of_a_house_alone(alias: str, house: ModuleType) -> None:
     daemon = ROOT / "daemon"
     taken = {
         (f"{file.relative_to(daemon)}:{node.lineno}", _chain(node))
         for file in sorted(daemon.rglob("*.py"))
         for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, ast.Attribute) and _chain(node)[:1] == ("tc",)
+        if isinstance(node, ast.Attribute) and _chain(node)[:1] == (alias,)
     }
     assert len({names[1:3] for _, names in taken}) > 100
-    assert [(where, names) for where, names in sorted(taken) if not _is_public(names[1:])] == []
+    assert [(where, names) for where, names in sorted(taken) if not _is_public(house, names[1:])] == []
 
 
 def _chain(node: ast.expr) -> tuple[str, ...]:
@@ -102,10 +104,9 @@ def _chain(node: ast.expr) -> tuple[str, ...]:
     return ()
 
 
-def _is_public(names: Sequence[str]) -> bool:
+def _is_public(module: object, names: Sequence[str]) -> bool:
     """Whether each name is one that the module before it offers: in its
     ``__all__``, or of its own making and without an underscore."""
-    module: object = triaxcal
     for name in names:
         if not isinstance(module, ModuleType):
             return True

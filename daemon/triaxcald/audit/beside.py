@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.outcome import ATTACHMENT, SUFFIX, digest_of
 from triaxcald.recording.mcap_records import ATTACHMENT_LIMIT
@@ -43,5 +43,5 @@ def outcomes_beside(path: Path) -> set[str]:
 
 
 def _read(file: Path) -> bytes:
-    with open_file(file) as stream:
+    with td.files.open_file(file) as stream:
         return stream.read(ATTACHMENT_LIMIT + 1)

@@ -11,7 +11,7 @@ from math import floor, log10
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.roles import LINEAR
+import triaxcal_drivers as td
 from triaxcald.audit.differences import SENTENCES
 
 SHARE = 1e-3
@@ -224,7 +224,7 @@ def _combined(budget: Mapping[str, Any]) -> dict[str, float | None]:
 def _place_of(role: str) -> str:
     """Of a register's role, where its coefficient stands in a budget."""
     group, _, name = role.partition(".")
-    return f"{group}[{'xyz'.index(name)}]" if group in LINEAR else f"effects.{role}"
+    return f"{group}[{'xyz'.index(name)}]" if group in td.roles.LINEAR else f"effects.{role}"
 
 
 def _placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError
+import triaxcal_drivers as td
 from triaxcald.audit.conduct import Audit, audit
 from triaxcald.errors import DONE, OUTSIDE, SEVEREST, DaemonError, InputError, exit_code_of
 from triaxcald.memory import out_of_memory, ran_out_of_memory
@@ -51,7 +51,7 @@ def worst(of: Iterable[Audited]) -> int:
 def _audited(path: Path) -> Audited:
     try:
         found = audit(path)
-    except (tc.TriaxcalError, DriverError, DaemonError) as e:
+    except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         return Audited(str(path), None, str(e), exit_code_of(e))
     except Exception as e:
         if not ran_out_of_memory(e):

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
-from triaxcal_drivers.profile import Profile
+import triaxcal_drivers as td
 from triaxcald.provision.restart_check import may_probe, neighbouring_values, own_steps, writes_of
 from triaxcald.recording.schema import RegisterAccess
 
@@ -54,7 +54,7 @@ class Marks:
     reads: set[int] = field(default_factory=set)
 
 
-def marks_in(accesses: Sequence[RegisterAccess], profile: Profile, asked: Collection[tuple[str, bytes]]) -> Marks:
+def marks_in(accesses: Sequence[RegisterAccess], profile: td.Profile, asked: Collection[tuple[str, bytes]]) -> Marks:
     """``asked`` are the values that registers are to hold, or held: none of
     them is one that only shows a restart."""
     found = Marks()
@@ -120,5 +120,5 @@ def _read(found: Marks, in_use: dict[str, Mark], mark: Mark | None, i: int, a: R
         found.reads.add(i)
 
 
-def _is_mark(profile: Profile, a: RegisterAccess, held: bytes, asked: Collection[tuple[str, bytes]]) -> bool:
+def _is_mark(profile: td.Profile, a: RegisterAccess, held: bytes, asked: Collection[tuple[str, bytes]]) -> bool:
     return (a.register, a.raw) not in asked and a.raw in neighbouring_values(profile, a.register, held)

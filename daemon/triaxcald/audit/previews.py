@@ -7,8 +7,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from triaxcal_drivers.interface import SampleBlock
-from triaxcal_drivers.profile import READINGS, Profile
+import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import PREVIEWS, Decimator, PreviewEncoder, preview_channels
@@ -25,13 +24,13 @@ class Previews:
     """Takes the decoded samples of both streams in the order in which they
     came."""
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: td.Profile) -> None:
         self._encoder = PreviewEncoder(preview_channels(profile))
         self._decimators = {topic: Decimator() for topic in PREVIEWS}
         self._digests: dict[str, list[bytes]] = {topic: [] for topic in PREVIEWS}
 
-    def feed(self, stream: str, block: SampleBlock) -> None:
-        topic = PREVIEWS[0] if stream == READINGS else PREVIEWS[1]
+    def feed(self, stream: str, block: td.SampleBlock) -> None:
+        topic = PREVIEWS[0] if stream == td.READINGS else PREVIEWS[1]
         for i in self._decimators[topic].pick(block):
             self._digests[topic].append(hashlib.sha256(self._encoder.encode(block, i)).digest())
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+import triaxcal_drivers as td
 from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
@@ -40,7 +39,7 @@ from triaxcald.verification import (
     verified,
 )
 
-CANNOT = (tc.TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
+CANNOT = (tc.TriaxcalError, td.DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
 """What a changed profile, station file or raw record may end in."""
 
 
@@ -59,7 +58,7 @@ class Again:
     certificate; ``verification`` is None where there are no check poses, or no
     output to check."""
 
-    bundle: Bundle
+    bundle: td.Bundle
     station: StationFile
     readings: Pipeline
     certified: Certified | None
@@ -76,7 +75,7 @@ class Again:
     @property
     def checked(self) -> bool:
         """Whether it then asks the device for its own output."""
-        return self.written and CORRECTED in self.bundle.profile.streams
+        return self.written and td.CORRECTED in self.bundle.profile.streams
 
     def ending(self) -> Ending | None:
         """Of a line that came to its end."""
@@ -104,7 +103,7 @@ def compute(recording: Recording, raw: Digests) -> Again:
         raise RecordingError(f"attachment {STATION_FILE}: missing")
     text = recording.attachments[STATION_FILE]
     station = parse_station(text, where=STATION_FILE)
-    streams = [s for s in (READINGS, CORRECTED) if s in bundle.profile.streams]
+    streams = [s for s in (td.READINGS, td.CORRECTED) if s in bundle.profile.streams]
     tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
     previews = Previews(bundle.profile)
     phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
@@ -120,19 +119,19 @@ def compute(recording: Recording, raw: Digests) -> Again:
                 previews.feed(stream, block)
     certified, why_not = None, ""
     try:
-        certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)
+        certified = _certified(recording, bundle, station, text, tumble[td.READINGS], raw.calibration)
     except CANNOT as e:
         why_not = str(e) or repr(e)
     verification = None
-    if raw.verification.records and CORRECTED in streams:
+    if raw.verification.records and td.CORRECTED in streams:
         verification = verification_document(
-            verified(tumble[CORRECTED], station.reference),
-            verified(check[CORRECTED], station.reference),
+            verified(tumble[td.CORRECTED], station.reference),
+            verified(check[td.CORRECTED], station.reference),
             limit_g=station.limits.verification_rms_g,
             raw_sha256=raw.verification.hexdigest(),
-            apart=_apart(recording, tumble[READINGS], station),
+            apart=_apart(recording, tumble[td.READINGS], station),
         )
-    return Again(bundle, station, tumble[READINGS], certified, why_not, verification, previews.thinned())
+    return Again(bundle, station, tumble[td.READINGS], certified, why_not, verification, previews.thinned())
 
 
 def _apart(recording: Recording, readings: Pipeline, station: StationFile) -> Apart:
@@ -140,7 +139,7 @@ def _apart(recording: Recording, readings: Pipeline, station: StationFile) -> Ap
 
 
 def _certified(
-    recording: Recording, bundle: Bundle, station: StationFile, text: bytes, pipeline: Pipeline, digest: RawDigest
+    recording: Recording, bundle: td.Bundle, station: StationFile, text: bytes, pipeline: Pipeline, digest: RawDigest
 ) -> Certified:
     unit, signs = recording.metadata.get("unit", {}), signs_of(recording)
     if signs is None:

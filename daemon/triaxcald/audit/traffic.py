@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from functools import cached_property
 
-from triaxcal_drivers.profile import Profile
-from triaxcal_drivers.roles import WRITE_COUNTER_ROLE
+import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
@@ -41,7 +40,7 @@ class Traffic:
     them, or were."""
 
     def __init__(
-        self, accesses: Iterable[RegisterAccess], profile: Profile, asked: Collection[tuple[str, bytes]] = ()
+        self, accesses: Iterable[RegisterAccess], profile: td.Profile, asked: Collection[tuple[str, bytes]] = ()
     ) -> None:
         self.accesses = list(accesses)
         self.profile = profile
@@ -112,7 +111,7 @@ class Traffic:
 
     def counts(self) -> list[bytes]:
         """What the device's counter of stores was read as."""
-        name = self.profile.by_role(WRITE_COUNTER_ROLE)
+        name = self.profile.by_role(td.roles.WRITE_COUNTER_ROLE)
         return [a.raw for a in self.accesses if a.register == name and a.operation == "read" and not a.error]
 
     def silent_since(self, at: int) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
-from triaxcal_drivers.hints import closest
+import triaxcal_drivers as td
 from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
 
@@ -70,7 +70,7 @@ def _require_command(top: OneLineParser, word: str) -> None:
     known = next(a.choices for a in top._actions if isinstance(a, argparse._SubParsersAction))
     if word.startswith("-") or word in known:
         return
-    close = closest(word, known)
+    close = td.hints.closest(word, known)
     hint = f"did you mean '{close}'?" if close else f"there are {', '.join(known)}"
     top.error(f"no command '{word}'; {hint}")
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.catalogue import BUILT_IN, listed, load_bundle
-from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
@@ -77,8 +76,8 @@ async def _registers(place: Place) -> tuple[str | None, list[Any]]:
 
 
 def devices_command(a: argparse.Namespace) -> int:
-    drivers = [dataclasses.asdict(d) for d in listed()]
-    profiles = [_profile(path) for path in sorted(BUILT_IN.glob("*.toml"))]
+    drivers = [dataclasses.asdict(d) for d in td.listed()]
+    profiles = [_profile(path) for path in sorted(td.BUILT_IN.glob("*.toml"))]
     effects = _effects()
     if a.json:
         emit({"format": "triaxcal.devices/1", "drivers": drivers, "profiles": profiles, "effects": effects})
@@ -94,8 +93,8 @@ def devices_command(a: argparse.Namespace) -> int:
 
 def _profile(path: Path) -> dict[str, Any]:
     try:
-        profile = load_bundle(path).profile
-    except (ProfileError, DriverMissing, DriverError) as e:
+        profile = td.load_bundle(path).profile
+    except (td.ProfileError, td.DriverMissing, td.DriverError) as e:
         return {"name": path.stem, "title": "", "driver": "", "fault": str(e)}
     return {"name": profile.name, "title": profile.title, "driver": profile.driver, "fault": None}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.profile import Profile
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.caveats import is_passing
 from triaxcald.certificate import held_by_device, image_of, why_not_written
@@ -137,7 +137,7 @@ def _require_little_lost(
     full: tc.estimate.Calibration,
     registers: tc.estimate.Reduced,
     path: str,
-    profile: Profile,
+    profile: td.Profile,
     logged: Mapping[str, tc.Floats],
 ) -> None:
     """Raises Refused where the registers would be off by more than the

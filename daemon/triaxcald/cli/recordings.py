@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import triaxcal as tc
-from triaxcal_drivers.catalogue import load_bundle
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.logs.kinds import Kind, opened
+import triaxcal_drivers as td
 from triaxcald.cli.console import at, emit, say, show
 from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
@@ -71,7 +69,7 @@ def _samples(path: Path, phases: Iterable[str]) -> dict[str, Any]:
     try:
         with open_recording(path, unfinished=True) as recording:
             return samples_of(recording, phases)
-    except (InputError, DriverError) as e:
+    except (InputError, td.DriverError) as e:
         return {"fault": str(e)}
 
 
@@ -152,16 +150,16 @@ def import_command(a: argparse.Namespace) -> int:
     writable(a.output)
     require_new(a.output)
     require_recording(a.output)
-    bundle = load_bundle(a.profile)
+    bundle = td.load_bundle(a.profile)
     driver = bundle.profile.driver
     if driver not in ("can", "mcap"):
         raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
     if driver == "mcap" and a.node is not None:
         raise InputError("--node: of a CAN bus; the profile's driver is 'mcap'")
     own = driver == "can" and is_own(a.log)
-    with nullcontext(own_log(a.log)) if own else opened(a.log) as log:
-        if isinstance(log.kind, Kind) != (driver == "can"):
-            name = log.kind.name if isinstance(log.kind, Kind) else log.kind
+    with nullcontext(own_log(a.log)) if own else td.logs.opened(a.log) as log:
+        if isinstance(log.kind, td.logs.Kind) != (driver == "can"):
+            name = log.kind.name if isinstance(log.kind, td.logs.Kind) else log.kind
             held = "frames of CAN" if driver == "can" else "messages"
             raise InputError(f"{a.log}: {name}, which holds no {held}; the profile's driver is '{driver}'")
         if driver == "can":

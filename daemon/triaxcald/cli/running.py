@@ -7,8 +7,7 @@ import sys
 from collections.abc import Callable
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError, RegisterValueError
-from triaxcal_drivers.hints import lacking
+import triaxcal_drivers as td
 from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, DaemonError, exit_code_of, severest
@@ -37,15 +36,15 @@ def _run(check: Callable[[], None], work: Callable[[], int]) -> int:
     except tc.Refused as e:
         say(f"triaxcal: refused: {e}" + (f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""))
         return REFUSED
-    except RegisterValueError as e:
+    except td.RegisterValueError as e:
         say(f"triaxcal: refused: {e}; nothing was written")
         return REFUSED
     except ModuleNotFoundError as e:
-        if ran_out_of_memory(e) or (what := lacking(e)) is None:
+        if ran_out_of_memory(e) or (what := td.hints.lacking(e)) is None:
             raise
         say(f"triaxcal: {what}")
         return BAD_INPUT
-    except (tc.TriaxcalError, DriverError, DaemonError) as e:
+    except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         say(f"triaxcal: {e}")
         return exit_code_of(e)
     except Interrupted as e:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import triaxcal as tc
-from triaxcal_drivers.hints import absent
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
@@ -170,7 +170,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
 
 
 def demo_command(a: argparse.Namespace) -> int:
-    if fault := absent(("can", "pymodbus")):
+    if fault := td.hints.absent(("can", "pymodbus")):
         raise InputError(f"demo: {fault}")
     from triaxcald.demo import run_demo
     from triaxcald.schema.run import Demo

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import triaxcal as tc
-from triaxcal_drivers.hints import closest
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable
@@ -42,7 +42,9 @@ class OneLineParser(argparse.ArgumentParser):
             self._mixing = False
         if left:
             unknown = next((word for word in left if word.startswith("--")), "").partition("=")[0]
-            close = closest(unknown.lstrip("-"), (o[2:] for o in self._option_string_actions if o.startswith("--")))
+            close = td.hints.closest(
+                unknown.lstrip("-"), (o[2:] for o in self._option_string_actions if o.startswith("--"))
+            )
             hint = f"; did you mean --{close}?" if close else ""
             self.error(f"unrecognized arguments: {' '.join(left)}{hint}")
         return found, left

@@ -11,9 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.interface import Decoder, RawBatch
-from triaxcal_drivers.profile import READINGS, Bundle
+import triaxcal_drivers as td
 from triaxcald.decoded import only_finite
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
@@ -122,19 +120,19 @@ class Importing:
     """One recording being made of a log's records. ``times`` are those of the
     readings' samples, by their own stamps or counter."""
 
-    def __init__(self, bundle: Bundle, writer: RecordingWriter) -> None:
-        driver = driver_named(bundle.profile.driver)
+    def __init__(self, bundle: td.Bundle, writer: RecordingWriter) -> None:
+        driver = td.driver_named(bundle.profile.driver)
         self.counts = dict.fromkeys(("samples", *COUNTED), 0)
         self.times = Times(1e9 / bundle.profile.sampling.rate_hz)
         self._writer = writer
-        self._decoders: dict[str, Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
+        self._decoders: dict[str, td.Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
         self._batches = 0
         self.two_senders = False
         """Whether two units send on the readings' stream."""
 
     def take(self, records: Sequence[Record]) -> None:
         """Raises RecordingError."""
-        batch = RawBatch.of(records)
+        batch = td.RawBatch.of(records)
         self._batches += 1
         if self._batches % DRAINED_EACH == 0:
             self._writer.drain()
@@ -143,7 +141,7 @@ class Importing:
             block = only_finite(decoder.feed(batch))
             if topic := _topic(name):
                 self._writer.preview(topic, block)
-            if name != READINGS:
+            if name != td.READINGS:
                 continue
             self.two_senders = self.two_senders or block.two_senders
             for what in COUNTED:
@@ -169,7 +167,7 @@ class _LogClock:
 
 
 def write_recording(
-    out: Path, bundle: Bundle, records: Iterator[Record], source: Path, describe: Describe
+    out: Path, bundle: td.Bundle, records: Iterator[Record], source: Path, describe: Describe
 ) -> tuple[dict[str, Any], float]:
     """Makes the recording ``out`` of all the records; its `imported` event, and
     the seconds that the samples cover.
@@ -189,7 +187,7 @@ def write_recording(
 
 
 def _write(
-    temporary: Path, out: Path, bundle: Bundle, records: Iterator[Record], source: Path, describe: Describe
+    temporary: Path, out: Path, bundle: td.Bundle, records: Iterator[Record], source: Path, describe: Describe
 ) -> tuple[dict[str, Any], float]:
     batches = in_batches(records)
     first = next(batches, [])

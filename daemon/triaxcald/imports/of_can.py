@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import triaxcal as tc
-from triaxcal_drivers.can.description import stream_layout
-from triaxcal_drivers.can.layout import NODES, Layout, Message
-from triaxcal_drivers.can.model import CanProfile
-from triaxcal_drivers.hints import clipped
-from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.can_frames import EXTENDED, LONGEST_NS, Account, LoggedFrame, Remark
-from triaxcal_drivers.logs.kinds import Kind, Log
-from triaxcal_drivers.profile import READINGS, Bundle
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.imports import notices
 from triaxcald.imports.importing import Imported, Importing, Record, Ticks, Times, write_recording
@@ -24,7 +17,7 @@ from triaxcald.imports.importing import Imported, Importing, Record, Ticks, Time
 # Which frames of a log are those of one unit: by the identifiers of its profile,
 # its node and its bus.
 
-_EXTENDED, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR)
+_EXTENDED, _ERROR = int(td.RawFlag.EXTENDED_ID), int(td.RawFlag.ERROR)
 SHOWN = 8  # identifiers or channels in a message
 
 KEPT_APART = 4096
@@ -45,7 +38,7 @@ class Selection:
     ``channel`` are what the user asked for; ``layouts`` are those of all
     streams, ``readings`` among them."""
 
-    layouts: Mapping[str, Layout]
+    layouts: Mapping[str, td.can.Layout]
     node: int | None = None
     channel: str | None = None
     frames: int = 0
@@ -60,14 +53,14 @@ class Selection:
         for layout in self.layouts.values():
             for message in layout.messages:
                 self._nodes |= _identifiers(message)
-        self._readings = {key for m in self.layouts[READINGS].messages for key in _identifiers(m)}
+        self._readings = {key for m in self.layouts[td.READINGS].messages for key in _identifiers(m)}
         counted = (m for layout in self.layouts.values() if layout.counters for m in layout.messages)
         self._counted = {key for m in counted for key in _identifiers(m)}
         self._seen: Counter[tuple[Key, str]] = Counter()
         self._strangers: Counter[int] = Counter()  # frames of other nodes than the one asked for
         self._of_unit: set[str] = set()  # channels
 
-    def takes(self, frame: LoggedFrame) -> bool:
+    def takes(self, frame: td.logs.LoggedFrame) -> bool:
         self.frames += 1
         name = frame.channel
         self.channels[name if name in self.channels or len(self.channels) < KEPT_APART else _OTHER_CHANNELS] += 1
@@ -94,12 +87,12 @@ class Selection:
         self.taken += 1
         return True
 
-    def is_reading(self, frame: LoggedFrame) -> bool:
+    def is_reading(self, frame: td.logs.LoggedFrame) -> bool:
         """Whether it is one of the messages that make a sample of the
         readings."""
         return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._readings
 
-    def is_counted(self, frame: LoggedFrame) -> bool:
+    def is_counted(self, frame: td.logs.LoggedFrame) -> bool:
         """Whether it is a message of a stream with a counter."""
         return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._counted
 
@@ -152,11 +145,11 @@ class Selection:
         return sorted({channel for _, channel in self._seen})
 
 
-def _identifiers(message: Message) -> dict[Key, int | None]:
+def _identifiers(message: td.can.Message) -> dict[Key, int | None]:
     flag = _EXTENDED if message.extended else 0
     if not message.per_node:
         return {(message.identifier, flag): None}
-    return {(message.identifier + node, flag): node for node in range(1, NODES + 1)}
+    return {(message.identifier + node, flag): node for node in range(1, td.can.NODES + 1)}
 
 
 def _identifiers_shown(keys: Iterable[Key]) -> str:
@@ -165,20 +158,22 @@ def _identifiers_shown(keys: Iterable[Key]) -> str:
 
 
 def _listed(counted: Mapping[Any, int]) -> str:
-    shown = [f"{clipped(what)} ({tc.number_format.number_of(count, 'frame')})" for what, count in counted.items()]
+    shown = [
+        f"{td.hints.clipped(what)} ({tc.number_format.number_of(count, 'frame')})" for what, count in counted.items()
+    ]
     return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
 
 
-def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:
+def import_can(log: td.logs.Log, bundle: td.Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:
     """Raises InputError, RecordingError, LogError, ProfileError."""
-    profile = cast(CanProfile, bundle.profile)
-    assert isinstance(log.kind, Kind)
+    profile = cast(td.can.CanProfile, bundle.profile)
+    assert isinstance(log.kind, td.logs.Kind)
     layouts = {
-        name: stream_layout(stream, bundle.files, where=f"profile {profile.name}, streams.{name}")
+        name: td.can.stream_layout(stream, bundle.files, where=f"profile {profile.name}, streams.{name}")
         for name, stream in profile.streams.items()
     }
     period_ns = 1e9 / profile.sampling.rate_hz
-    work = _Work(Selection(layouts, node, channel), Account(), Times(period_ns), Ticks(period_ns))
+    work = _Work(Selection(layouts, node, channel), td.logs.Account(), Times(period_ns), Ticks(period_ns))
 
     def describe(importing: Importing) -> dict[str, Any]:
         return work.described(log, importing)
@@ -187,19 +182,19 @@ def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel
     return Imported(out, detail, seconds)
 
 
-_LOST_BEFORE = int(RawFlag.LOST_BEFORE)
+_LOST_BEFORE = int(td.RawFlag.LOST_BEFORE)
 
 
 class _Work:
     """What is counted on the way."""
 
-    def __init__(self, selection: Selection, account: Account, times: Times, ticks: Ticks) -> None:
+    def __init__(self, selection: Selection, account: td.logs.Account, times: Times, ticks: Ticks) -> None:
         self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
         self._readings = Times(times.period_ns)
         self._latest_ns: dict[tuple[int, int], int] = {}  # by identifier
         self._marked_ns = -1  # where a pause was marked last
 
-    def records(self, log: Log) -> Iterator[Record]:
+    def records(self, log: td.logs.Log) -> Iterator[Record]:
         """A loss before a frame that is not taken was before the next that is:
         it may have been of the unit's. A pause is such a loss, as counters may
         have wrapped meanwhile."""
@@ -210,7 +205,7 @@ class _Work:
             if not self._selection.takes(frame):
                 continue
             time_ns = self._time_ns(frame)
-            if not 0 <= time_ns < LONGEST_NS:
+            if not 0 <= time_ns < td.logs.LONGEST_NS:
                 self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
                 continue
             self._times.note(time_ns)
@@ -219,26 +214,26 @@ class _Work:
             lost.discard(frame.channel)
             yield time_ns, frame.source, flags, frame.data
 
-    def _paused(self, frame: LoggedFrame, time_ns: int) -> bool:
+    def _paused(self, frame: td.logs.LoggedFrame, time_ns: int) -> bool:
         """Whether this is the first frame of a stream with a counter after a
         pause of that."""
         if self._selection.is_reading(frame):
             self._readings.note(time_ns)
         if not self._selection.is_counted(frame):
             return False
-        key = frame.source, frame.flags & EXTENDED
+        key = frame.source, frame.flags & td.logs.EXTENDED
         before_ns, self._latest_ns[key] = self._latest_ns.get(key, time_ns), time_ns
         if not self._times.is_pause(time_ns - before_ns) or self._marked_ns > before_ns:
             return False
         self._marked_ns = time_ns
         return True
 
-    def _time_ns(self, frame: LoggedFrame) -> int:
-        if Remark.NO_TIMES in self._account.remarks:
-            return self._ticks.of((frame.source, frame.flags & EXTENDED), self._selection.is_reading(frame))
+    def _time_ns(self, frame: td.logs.LoggedFrame) -> int:
+        if td.logs.Remark.NO_TIMES in self._account.remarks:
+            return self._ticks.of((frame.source, frame.flags & td.logs.EXTENDED), self._selection.is_reading(frame))
         return -1 if frame.time_ns is None else frame.time_ns
 
-    def described(self, log: Log, importing: Importing) -> dict[str, Any]:
+    def described(self, log: td.logs.Log, importing: Importing) -> dict[str, Any]:
         """Raises InputError."""
         chosen, account, counts = self._selection, self._account, importing.counts
         try:
@@ -252,7 +247,7 @@ class _Work:
         except InputError as e:
             others = "".join(f"; {count} of kind '{kind}'" for kind, count in account.others.items())
             raise InputError(f"{e}{others}" + (f"; damaged: {account.damage}" if account.damaged else "")) from e
-        assert isinstance(log.kind, Kind)
+        assert isinstance(log.kind, td.logs.Kind)
         return {
             "kind": log.kind.name,
             "channels": chosen.from_channels,

@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import triaxcal as tc
-from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.hints import clipped, nearest
-from triaxcal_drivers.logs.can_frames import LONGEST_NS, Account
-from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
-from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
-from triaxcal_drivers.mcap.driver import McapProfile, schema_file, stream_reader
-from triaxcal_drivers.mcap.messages import MessageSchema
-from triaxcal_drivers.profile import READINGS, Bundle
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.imports import notices
 from triaxcald.imports.importing import Imported, Importing, Record, Times, write_recording
@@ -34,13 +27,13 @@ class Channels:
     topics than its own."""
 
     topics: Collection[str]
-    only: Channel | None = None
+    only: td.mcap.Channel | None = None
     elsewhere: int = 0  # messages of other channels of its topic
-    _seen: Counter[Channel] = field(default_factory=Counter)
+    _seen: Counter[td.mcap.Channel] = field(default_factory=Counter)
     _latest: dict[str, int] = field(default_factory=dict)  # channel by topic
     _mixed: set[str] = field(default_factory=set)  # topics
 
-    def takes(self, channel: Channel) -> bool:
+    def takes(self, channel: td.mcap.Channel) -> bool:
         topic, number = channel.topic, channel.number
         if self.only is not None and topic == self.only.topic and number != self.only.number:
             self.elsewhere += 1
@@ -60,19 +53,24 @@ class Channels:
             topic = min(self._mixed)
             its = listed((channel, count) for channel, count in self._seen.items() if channel.topic == topic)
             raise InputError(
-                f"{name}: topic '{clipped(topic)}' comes on the channels {its}; --channel says which is the unit's"
+                f"{name}: topic '{td.hints.clipped(topic)}' comes on the channels {its}; --channel says which "
+                "is the unit's"
             )
         return len(self._seen) > len(self._latest)
 
 
-def listed(counted: Iterable[tuple[Channel, int]]) -> str:
+def listed(counted: Iterable[tuple[td.mcap.Channel, int]]) -> str:
     """Channels by number, each with what its publisher says of itself and no
     other does, and how many messages it has."""
     counts = list(counted)
     common = set.intersection(*(set(channel.metadata) for channel, _ in counts)) if counts else set()
     shown = []
     for channel, count in counts[:CHANNELS_SHOWN]:
-        own = [f"{clipped(key)} {clipped(value)}" for key, value in channel.metadata if (key, value) not in common]
+        own = [
+            f"{td.hints.clipped(key)} {td.hints.clipped(value)}"
+            for key, value in channel.metadata
+            if (key, value) not in common
+        ]
         shown.append(f"{channel.number} ({', '.join([*own[:1], tc.number_format.number_of(count, 'message')])})")
     return ", ".join(shown) + (", …" if len(counts) > CHANNELS_SHOWN else "")
 
@@ -82,12 +80,12 @@ STAMPS_LOOKED_AT = 10_000  # messages by whose stamps it is told whether they mo
 SHOWN = 12  # topics in a message
 
 
-def import_mcap(log: Log, bundle: Bundle, out: Path, *, channel: str | None = None) -> Imported:
+def import_mcap(log: td.logs.Log, bundle: td.Bundle, out: Path, *, channel: str | None = None) -> Imported:
     """Raises InputError, RecordingError, LogError, ProfileError."""
-    profile = cast(McapProfile, bundle.profile)
+    profile = cast(td.mcap.McapProfile, bundle.profile)
     only = None if channel is None else _asked_for(log, profile, channel)
     schemas = _schemas(log, profile, only)
-    files = {schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
+    files = {td.mcap.schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
     whole = replace(bundle, files={**bundle.files, **files})
     work = _Work(profile, log, only)
     still = any(schema.stamp_stands_still for schema in schemas.values())
@@ -99,11 +97,11 @@ def import_mcap(log: Log, bundle: Bundle, out: Path, *, channel: str | None = No
     return Imported(out, detail, seconds)
 
 
-def _asked_for(log: Log, profile: McapProfile, number: str) -> Channel:
+def _asked_for(log: td.logs.Log, profile: td.mcap.McapProfile, number: str) -> td.mcap.Channel:
     """The channel of that number. Raises InputError where none of the profile's
     topics has it."""
     topics = {stream.topic for stream in profile.streams.values()}
-    channels = (message.channel for message in McapFile(log.stream, Account()).messages())
+    channels = (message.channel for message in td.mcap.McapFile(log.stream, td.logs.Account()).messages())
     counted = Counter(channel for channel in channels if channel.topic in topics)
     for channel in counted:
         if str(channel.number) == number:
@@ -112,11 +110,13 @@ def _asked_for(log: Log, profile: McapProfile, number: str) -> Channel:
     raise InputError(f"--channel {number}: {log.name} has {there}")
 
 
-def _schemas(log: Log, profile: McapProfile, only: Channel | None) -> dict[str, MessageSchema]:
+def _schemas(
+    log: td.logs.Log, profile: td.mcap.McapProfile, only: td.mcap.Channel | None
+) -> dict[str, td.mcap.MessageSchema]:
     """Of each stream whose topic is there, from the log's first messages.
     Raises InputError."""
-    file = McapFile(log.stream, Account())
-    first: dict[str, LoggedMessage] = {}
+    file = td.mcap.McapFile(log.stream, td.logs.Account())
+    first: dict[str, td.mcap.LoggedMessage] = {}
     heads: dict[str, list[bytes]] = {}
     topics = {stream.topic for stream in profile.streams.values()}
     chosen = Channels(topics, only)
@@ -137,27 +137,27 @@ def _schemas(log: Log, profile: McapProfile, only: Channel | None) -> dict[str, 
             found[name] = replace(schema, stamp_stands_still=_stands_still(profile, name, schema, heads[stream.topic]))
         elif name == "readings":
             there = list(file.topics)
-            shown = ", ".join(map(clipped, there[:SHOWN])) or "none"
-            hint = nearest(stream.topic, there) or f"; there are {shown}"
+            shown = ", ".join(map(td.hints.clipped, there[:SHOWN])) or "none"
+            hint = td.hints.nearest(stream.topic, there) or f"; there are {shown}"
             raise InputError(f"{log.name}: no message on topic '{stream.topic}'{hint}")
     return found
 
 
-def _schema(channel: Channel, name: str) -> MessageSchema:
+def _schema(channel: td.mcap.Channel, name: str) -> td.mcap.MessageSchema:
     schema = channel.schema
     if schema is None and channel.encoding != "json":
         raise InputError(
-            f"{name}: topic '{clipped(channel.topic)}' has no schema, and is encoded as {channel.encoding}"
+            f"{name}: topic '{td.hints.clipped(channel.topic)}' has no schema, and is encoded as {channel.encoding}"
         )
     if schema is None:
-        return MessageSchema("", channel.encoding, "", b"")
-    return MessageSchema(schema.name, channel.encoding, schema.encoding, schema.data)
+        return td.mcap.MessageSchema("", channel.encoding, "", b"")
+    return td.mcap.MessageSchema(schema.name, channel.encoding, schema.encoding, schema.data)
 
 
-def _stands_still(profile: McapProfile, name: str, schema: MessageSchema, head: list[bytes]) -> bool:
+def _stands_still(profile: td.mcap.McapProfile, name: str, schema: td.mcap.MessageSchema, head: list[bytes]) -> bool:
     """Raises ProfileError where the messages do not hold what the profile
     names."""
-    read = stream_reader(profile, name, schema)
+    read = td.mcap.stream_reader(profile, name, schema)
     if profile.streams[name].time is None:
         return False
     stamps = set()
@@ -174,19 +174,19 @@ def _stands_still(profile: McapProfile, name: str, schema: MessageSchema, head: 
 class _Work:
     """What is counted on the way."""
 
-    def __init__(self, profile: McapProfile, log: Log, only: Channel | None) -> None:
+    def __init__(self, profile: td.mcap.McapProfile, log: td.logs.Log, only: td.mcap.Channel | None) -> None:
         self._profile, self._log = profile, log
-        self._account = Account()
+        self._account = td.logs.Account()
         self._times = Times(1e9 / profile.sampling.rate_hz)
         self._numbers = {stream.topic: i for i, stream in enumerate(profile.streams.values())}
-        self._readings = list(profile.streams).index(READINGS)
+        self._readings = list(profile.streams).index(td.READINGS)
         self._channels = Channels(self._numbers, only)
-        self._first: dict[str, Channel] = {}  # by topic
+        self._first: dict[str, td.mcap.Channel] = {}  # by topic
         self._messages = self._taken = self._others = 0
 
     def records(self) -> Iterator[Record]:
         """Raises LogError."""
-        for message in McapFile(self._log.stream, self._account).messages():
+        for message in td.mcap.McapFile(self._log.stream, self._account).messages():
             self._messages += 1
             topic = message.channel.topic
             if topic not in self._numbers:
@@ -197,14 +197,15 @@ class _Work:
             first = self._first.setdefault(topic, message.channel)
             if first.schema != message.channel.schema:
                 says = "" if first.number == message.channel.number else "; --channel says which is the unit's"
-                raise LogError(
-                    f"{self._log.name}: topic '{clipped(topic)}' has messages of two definitions, on the channels"
+                raise td.LogError(
+                    f"{self._log.name}: topic '{td.hints.clipped(topic)}' has messages of two definitions, on "
+                    "the channels"
                     f" {first.number} and {message.channel.number}{says}"
                 )
             where = f"message {self._messages}"
             if len(message.data) > MESSAGE_MOST:
                 self._account.note(where, f"{len(message.data)} bytes, expected at most {MESSAGE_MOST}")
-            elif message.log_time_ns >= LONGEST_NS:
+            elif message.log_time_ns >= td.logs.LONGEST_NS:
                 self._account.note(where, f"a time of {message.log_time_ns} ns")
             else:
                 self._taken += 1
@@ -223,7 +224,7 @@ class _Work:
                 f"the profile: {why}"
             )
         return {
-            "kind": MCAP_KIND,
+            "kind": td.logs.MCAP_KIND,
             "channels": list(self._numbers),
             "node": None,
             "frames": self._messages,

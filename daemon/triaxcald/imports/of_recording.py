@@ -9,16 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from triaxcal_drivers.files import open_file
-from triaxcal_drivers.logs.can_frames import Account, LoggedFrame
-from triaxcal_drivers.logs.kinds import MCAP, Kind, Log
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.recording.bus import frame_rows, is_of_bus
 from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.schema import PROFILE
 from triaxcald.recording.series import open_recording
 
-_PROFILE = slice(len(MCAP) + 13, len(MCAP) + 13 + len(PROFILE))
+_PROFILE = slice(len(td.logs.MCAP) + 13, len(td.logs.MCAP) + 13 + len(PROFILE))
 """Of an MCAP file, behind its header's type and length and its own."""
 
 
@@ -28,7 +26,7 @@ def is_own(path: Path) -> bool:
     if is_manifest(path):
         return True
     try:
-        with open_file(path) as file:
+        with td.files.open_file(path) as file:
             head = file.read(_PROFILE.stop)
             packed = head.startswith(b"\x1f\x8b")
             if packed:
@@ -36,20 +34,20 @@ def is_own(path: Path) -> bool:
                 head = gzip.GzipFile(fileobj=file).read(_PROFILE.stop)
     except (OSError, EOFError, zlib.error):
         return False
-    own = head.startswith(MCAP) and head[_PROFILE] == PROFILE.encode()
+    own = head.startswith(td.logs.MCAP) and head[_PROFILE] == PROFILE.encode()
     if own and packed:
         raise InputError(f"{path}: a recording of triaxcal, packed with gzip; unpack it first")
     return own
 
 
-def own_log(path: Path) -> Log:
+def own_log(path: Path) -> td.logs.Log:
     """Its frames raise RecordingError, InputError."""
 
-    def frames(_: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+    def frames(_: BinaryIO, account: td.logs.Account) -> Iterator[td.logs.LoggedFrame]:
         with open_recording(path) as recording:
             if not is_of_bus(recording):
                 raise InputError(f"{path}: a recording of one unit already, expected one of all frames of a bus")
             for row in frame_rows(recording):
-                yield LoggedFrame(*row)
+                yield td.logs.LoggedFrame(*row)
 
-    return Log(str(path), Kind("triaxcal", frames), io.BytesIO())
+    return td.logs.Log(str(path), td.logs.Kind("triaxcal", frames), io.BytesIO())

@@ -10,10 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
-from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
-from triaxcal_drivers.profile import Profile, WriteStep
-from triaxcal_drivers.two_senders import ExtraAnswer
+import triaxcal_drivers as td
 from triaxcald.errors import DaemonError, TwoAnswer
 
 
@@ -34,7 +31,7 @@ Kind = Literal["read", "write"]
 
 RETRIES = 2
 """A lost request in a hundred then fails one request in a million."""
-NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
+NO_CONTACT = (td.BusError, td.DeviceAbsent, td.DeviceSilent)
 """Errors without any answer. Unlike a refusal, they leave open whether the device
 carried the request out."""
 
@@ -70,8 +67,8 @@ class RegisterLink:
 
     def __init__(
         self,
-        device: Device,
-        profile: Profile,
+        device: td.Device,
+        profile: td.Profile,
         record: Callable[[RegisterAccess], None] | None = None,
         *,
         clock: Clock = SYSTEM_CLOCK,
@@ -81,7 +78,7 @@ class RegisterLink:
         self.clock, self.name, self.profile = clock, name, profile
         self._device = device
         self._record = record or (lambda access: None)
-        self._once = {step.write for step in steps if isinstance(step, WriteStep)}
+        self._once = {step.write for step in steps if isinstance(step, td.WriteStep)}
         self._tired: set[Kind] = set()
         self._not_opened: str | None = None
         self._watched = False
@@ -107,7 +104,7 @@ class RegisterLink:
     async def close(self) -> None:
         await self._device.close()
 
-    def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+    def stream(self, names: Sequence[str]) -> AsyncIterator[td.RawBatch]:
         return self._device.stream(names)
 
     def refresh(self) -> None:
@@ -134,7 +131,7 @@ class RegisterLink:
         self._watched, self._second = False, None
         self.tolerant = True
 
-    async def listen(self, seconds: float) -> list[ExtraAnswer]:
+    async def listen(self, seconds: float) -> list[td.two_senders.ExtraAnswer]:
         """Listen for ``seconds`` of the host's clock.
 
         Returns the answers that belong to no request and contradict the first
@@ -142,7 +139,7 @@ class RegisterLink:
         none.
         """
         listen = getattr(self._device, "listen", None)
-        extra: list[ExtraAnswer] = [] if listen is None else await listen(seconds)
+        extra: list[td.two_senders.ExtraAnswer] = [] if listen is None else await listen(seconds)
         self.doubled += sum(e.same for e in extra)
         return [e for e in extra if not e.same]
 
@@ -168,13 +165,13 @@ class RegisterLink:
     async def _patiently(self, kind: Kind, request: Callable[[], Awaitable[T]]) -> T:
         left, busy_since_s = RETRIES, None
         while True:
-            failure: DriverError
+            failure: td.DriverError
             try:
                 answer = await request()
-            except DeviceBusy as e:
+            except td.DeviceBusy as e:
                 failure, now_s = e, self.clock.now_s()
                 busy_since_s = now_s if busy_since_s is None else busy_since_s
-                patient = now_s - busy_since_s < BUSY_S
+                patient = now_s - busy_since_s < td.BUSY_S
             except NO_CONTACT as e:
                 failure, patient = e, left > 0
                 left -= 1
@@ -184,9 +181,9 @@ class RegisterLink:
             if kind in self._tired or not patient:
                 self._tired.add(kind)
                 raise failure
-            if isinstance(failure, DeviceBusy):
-                await self.clock.sleep(BUSY_PAUSE_S)
-            elif not isinstance(failure, DeviceSilent):
+            if isinstance(failure, td.DeviceBusy):
+                await self.clock.sleep(td.BUSY_PAUSE_S)
+            elif not isinstance(failure, td.DeviceSilent):
                 await self.renew()
 
     async def _require_one_answer(self) -> None:
@@ -224,10 +221,10 @@ class RegisterLink:
         opening."""
         try:
             yield
-        except DriverError as e:
+        except td.DriverError as e:
             no_contact = isinstance(e, NO_CONTACT)
             why = str(e) if self._not_opened is None or not no_contact else self._not_opened
             self._record(RegisterAccess(kind, register, raw, why, no_contact))
             if why == str(e):
                 raise
-            raise BusError(why) from e
+            raise td.BusError(why) from e

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from triaxcal_drivers.errors import RegisterValueError
-from triaxcal_drivers.profile import Bundle, Profile
+import triaxcal_drivers as td
 from triaxcald.provision.registers import Snapshot, checksum_of
 
 
@@ -25,13 +24,13 @@ class Row:
     crc_ok: bool | None
 
 
-def explain(bundle: Bundle, snapshot: Snapshot) -> list[Row]:
+def explain(bundle: td.Bundle, snapshot: Snapshot) -> list[Row]:
     """A row for each register of the snapshot. Raises RegisterValueError on
     bytes of a wrong length."""
     return [_row(bundle.profile, snapshot, name) for name in snapshot.raw]
 
 
-def _row(profile: Profile, snapshot: Snapshot, name: str) -> Row:
+def _row(profile: td.Profile, snapshot: Snapshot, name: str) -> Row:
     register, raw = profile.registers[name], snapshot.raw[name]
     value = profile.decode(name, raw)
     low = -math.inf if register.minimum is None else register.minimum
@@ -49,8 +48,8 @@ def _row(profile: Profile, snapshot: Snapshot, name: str) -> Row:
     )
 
 
-def _checksum_ok(profile: Profile, snapshot: Snapshot, held: float) -> bool:
+def _checksum_ok(profile: td.Profile, snapshot: Snapshot, held: float) -> bool:
     try:
         return checksum_of(profile, snapshot.raw) == held
-    except RegisterValueError:  # a register holds no number
+    except td.RegisterValueError:  # a register holds no number
         return False

@@ -7,11 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import Bundle, Profile
-from triaxcal_drivers.registers import TYPES
-from triaxcal_drivers.two_senders import ExtraAnswer
+import triaxcal_drivers as td
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.sequence import contact_register
@@ -40,7 +36,7 @@ class IdentityRead:
 
 
 async def check_identity(
-    device: Device, bundle: Bundle, expected_serial: str | None, *, where: str | None = None
+    device: td.Device, bundle: td.Bundle, expected_serial: str | None, *, where: str | None = None
 ) -> IdentityRead:
     """Read who answers and compare. ``where`` names the place in messages; by
     default the profile.
@@ -69,30 +65,30 @@ async def check_identity(
 
 
 async def identified(
-    link: RegisterLink, bundle: Bundle, expected_serial: str | None, *, where: str, device: Device | None = None
+    link: RegisterLink, bundle: td.Bundle, expected_serial: str | None, *, where: str, device: td.Device | None = None
 ) -> IdentityRead:
     """`check_identity` of the ``device`` (default: the link), and a check that no
     other unit answers at the address. Raises TwoAnswer too."""
     try:
         identity = await check_identity(device or link, bundle, expected_serial, where=where)
     except WrongUnit:
-        with suppress(DriverError):  # the answer may be that of a second unit
+        with suppress(td.DriverError):  # the answer may be that of a second unit
             await require_alone(link, bundle)
         raise
     await require_alone(link, bundle)
     return identity
 
 
-def _wrong(profile: Profile, name: str, number: int) -> type[WrongUnit]:
+def _wrong(profile: td.Profile, name: str, number: int) -> type[WrongUnit]:
     """Diagnosis of an unexpected number in a register of the identity."""
-    ones = 256 ** TYPES[profile.registers[name].type].size - 1
+    ones = 256 ** td.registers.TYPES[profile.registers[name].type].size - 1
     return BlankIdentity if number in (0, -1, ones) else WrongUnit
 
 
-async def _also(link: RegisterLink, bundle: Bundle, serial: str) -> bool:
+async def _also(link: RegisterLink, bundle: td.Bundle, serial: str) -> bool:
     """Whether the unit of that serial number answers behind another one."""
     name = bundle.profile.identity.serial_register
-    size = 0 if name is None else TYPES[bundle.profile.registers[name].type].size
+    size = 0 if name is None else td.registers.TYPES[bundle.profile.registers[name].type].size
     late = [e.answer for e in await link.listen(LISTEN_S) if e.register == name and len(e.answer) == size]
     numbers = [bundle.profile.raw_number(name, raw) for raw in late if name is not None]
     return any(same_serial(serial_text(n), serial) for n in numbers if n is not None)
@@ -108,7 +104,7 @@ ASKED = 3
 doubles one answer in twenty does so by chance once in ten thousand times."""
 
 
-async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
+async def require_alone(link: RegisterLink, bundle: td.Bundle) -> None:
     """Ask the unit for its serial number, and listen whether another unit
     answers too.
 
@@ -126,7 +122,7 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
         answers, found = await _answers(link, name)
         if found:
             link.two_answered = True
-            with suppress(DriverError, TwoAnswer):  # late answers to earlier requests have come by now
+            with suppress(td.DriverError, TwoAnswer):  # late answers to earlier requests have come by now
                 answers, _ = await _answers(link, name)
             raise TwoAnswer(f"two units answer at {link.name}: {_who(bundle, name, answers)}")
         if not link.doubled:
@@ -135,10 +131,10 @@ async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
     raise TwoAnswer(f"two units answer at {link.name}: each request was answered twice, byte for byte")
 
 
-async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[ExtraAnswer]]:
+async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[td.two_senders.ExtraAnswer]]:
     """Value of a register, and the contradicting answers."""
     answers = [await link.read(name)]
-    most = max(TYPES[link.profile.registers[name].type].size, ABORT_BYTES)
+    most = max(td.registers.TYPES[link.profile.registers[name].type].size, ABORT_BYTES)
     # Another program may ask the unit for something else, and a stream may be
     # polled meanwhile, whose replies are longer than a register.
     extra = await link.listen(LISTEN_S)
@@ -146,10 +142,10 @@ async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[Ext
     return answers + [e.answer for e in found], found
 
 
-def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:
+def _who(bundle: td.Bundle, name: str, answers: Sequence[bytes]) -> str:
     """The serial numbers, as far as they are any."""
     known = bundle.profile.registers[name]
-    size = TYPES[known.type].size
+    size = td.registers.TYPES[known.type].size
     numbers = [bundle.profile.raw_number(name, raw) for raw in answers if len(raw) == size]
     if name != bundle.profile.identity.serial_register:
         return ", ".join(f"register {name} holds {raw.hex()}" for raw in dict.fromkeys(answers))
@@ -157,14 +153,14 @@ def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:
     return ", ".join(told) if len(told) > 1 else ", ".join([*told, "and one that answers otherwise"])
 
 
-async def read_serial(device: Device, bundle: Bundle) -> str | None:
+async def read_serial(device: td.Device, bundle: td.Bundle) -> str | None:
     """The serial number as `IdentityRead` has it. Raises RegisterRefused,
     DeviceSilent; BlankIdentity where the register holds no number."""
     name = bundle.profile.identity.serial_register
     return serial_text(await _read_raw_number(device, bundle, name)) if name else None
 
 
-async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
+async def _read_raw_number(device: td.Device, bundle: td.Bundle, name: str) -> int:
     raw = await device.read(name)
     number = bundle.profile.raw_number(name, raw)
     if number is None:

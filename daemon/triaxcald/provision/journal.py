@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from triaxcal_drivers.profile import Bundle, Profile
+import triaxcal_drivers as td
 from triaxcald.errors import DiskError, InputError
 from triaxcald.files import synchronise, write_durably
 from triaxcald.provision.access import RegisterLink
@@ -46,7 +46,7 @@ class Owner:
     slot: str
 
     @staticmethod
-    def of(profile: Profile, slot: str, serial: str | None) -> Owner:
+    def of(profile: td.Profile, slot: str, serial: str | None) -> Owner:
         """``serial`` as a station file or a device states it."""
         stated = serial.strip() if serial else None
         if stated and (number := _WHOLE.fullmatch(stated)):  # as `serial_text` has it
@@ -151,7 +151,7 @@ def _safe(name: str) -> str:
     return _UNSAFE.sub("_", name)
 
 
-def journals_of(folder: Path, owner: Owner, profile: Profile) -> list[tuple[Journal, Entry]]:
+def journals_of(folder: Path, owner: Owner, profile: td.Profile) -> list[tuple[Journal, Entry]]:
     """The journals in the station's folder that may be of the unit, the newest
     first, without those that are known to be of another product.
 
@@ -176,7 +176,7 @@ def journals_of(folder: Path, owner: Owner, profile: Profile) -> list[tuple[Jour
     return found
 
 
-def open_journal(folder: Path, profile: Profile, slot: str, serial: str | None) -> Path | None:
+def open_journal(folder: Path, profile: td.Profile, slot: str, serial: str | None) -> Path | None:
     """The path of the newest journal that may be of the unit. None if there is
     none, or if the serial number of the unit is not known yet."""
     if serial is None and profile.identity.serial_register is not None:
@@ -221,7 +221,7 @@ def registers_of(held: Mapping[str, str]) -> dict[str, bytes]:
 
 
 async def journaled_image(
-    link: RegisterLink, bundle: Bundle, *, folder: Path, unit: str, expected_serial: str | None, where: str
+    link: RegisterLink, bundle: td.Bundle, *, folder: Path, unit: str, expected_serial: str | None, where: str
 ) -> tuple[RegisterImage, str | None]:
     """The wanted image of this device's interrupted provisioning, and the device's
     serial number.
@@ -249,7 +249,7 @@ def _fits(entry: Entry, held: Snapshot) -> bool:
     return all(raw in (entry.before.get(name), entry.wanted.get(name)) for name, raw in held.raw.items())
 
 
-def was_cut_short(entry: Entry, profile: Profile, found: Snapshot, image: RegisterImage, restarted: bool) -> bool:
+def was_cut_short(entry: Entry, profile: td.Profile, found: Snapshot, image: RegisterImage, restarted: bool) -> bool:
     """Whether a device with a journal still is as that provisioning left it,
     and not as somebody has made it since.
 

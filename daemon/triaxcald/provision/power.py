@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from triaxcal_drivers.errors import DriverError, RegisterRefused
-from triaxcal_drivers.profile import Profile
+import triaxcal_drivers as td
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.sequence import contact_register, reconnect
 
@@ -16,12 +15,12 @@ MISSED = 3
 on a link that loses one in a hundred."""
 
 
-def least_off_s(profile: Profile) -> float:
+def least_off_s(profile: td.Profile) -> float:
     """Shortest time without supply that is detected [s]."""
     return MISSED * (profile.sampling.reply_timeout_s + LOOK_S)
 
 
-async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) -> bool:
+async def power_cycled(link: RegisterLink, profile: td.Profile, patience_s: float) -> bool:
     """Whether the device, within ``patience_s``, answers, goes silent and answers
     again. A busy or refusing device has its supply.
     """
@@ -33,13 +32,13 @@ async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) 
         try:
             await link.read_once(register)
             missed, answered = 0, True
-        except RegisterRefused:
+        except td.RegisterRefused:
             missed, answered = 0, True
         except NO_CONTACT:
             missed += answered
             await link.renew()
         await link.clock.sleep(LOOK_S)
-    with suppress(DriverError):
+    with suppress(td.DriverError):
         await reconnect(link, profile, max(deadline_s - link.clock.now_s(), LOOK_S))
         return True
     return False

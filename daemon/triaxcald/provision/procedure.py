@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from triaxcal_drivers.errors import DriverError, RegisterRefused
-from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
-from triaxcal_drivers.roles import WRITE_COUNTER_ROLE
+import triaxcal_drivers as td
 from triaxcald.errors import DiskError, InputError, ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
@@ -39,7 +37,7 @@ Images = Sequence[Mapping[str, bytes]]
 
 async def restore(
     link: RegisterLink,
-    bundle: Bundle,
+    bundle: td.Bundle,
     snapshot: Snapshot,
     *,
     stored: bool = True,
@@ -66,29 +64,29 @@ async def restore(
         doubtful = stored and not restarted and bool(bundle.profile.sequences.store)
         if await differing(link, bundle, snapshot) or doubtful:
             restarted = await _write_back(link, bundle, snapshot, known, stored)
-    except DriverError as e:
+    except td.DriverError as e:
         raise ProvisionError(str(e)) from e
     if not stored:
         return Evidence.NOTHING_STORED
     return Evidence.RESTART if restarted else Evidence.READ_BACK
 
 
-async def let_a_store_end(link: RegisterLink, bundle: Bundle) -> None:
+async def let_a_store_end(link: RegisterLink, bundle: td.Bundle) -> None:
     """Wait for a running store to end: a restart in the middle of it could corrupt
     the stored copy."""
-    waits = [step for step in bundle.profile.sequences.store if isinstance(step, (WaitStep, PollStep))]
-    with suppress(DriverError, StationError):
+    waits = [step for step in bundle.profile.sequences.store if isinstance(step, (td.WaitStep, td.PollStep))]
+    with suppress(td.DriverError, StationError):
         await run_steps(link, bundle, "store", waits)
 
 
-async def differing(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> tuple[str, ...]:
+async def differing(link: RegisterLink, bundle: td.Bundle, snapshot: Snapshot) -> tuple[str, ...]:
     """Registers of the snapshot's own unit that differ from the snapshot. Raises
     WrongUnit, DriverError."""
     await check_identity(link, bundle, snapshot.serial)
     return snapshot.differing((await take_snapshot(link, bundle, snapshot.raw)).raw)
 
 
-async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
+async def _contact(link: RegisterLink, bundle: td.Bundle, snapshot: Snapshot) -> None:
     """Check the identity, over a new connection if the device just lost its power."""
     try:
         await check_identity(link, bundle, snapshot.serial)
@@ -97,7 +95,7 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
         await check_identity(link, bundle, snapshot.serial)
 
 
-async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images) -> bool:
+async def _restart(link: RegisterLink, bundle: td.Bundle, snapshot: Snapshot, known: Images) -> bool:
     """Whether a probe shows that the device restarted."""
     if not bundle.profile.sequences.reset:
         return False
@@ -106,11 +104,11 @@ async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known
         return (await checked_restart(link, bundle, snapshot.serial, *known)).probe_gone
     except WrongUnit:  # one of ProvisionError
         raise
-    except (RegisterRefused, ProvisionError):
+    except (td.RegisterRefused, ProvisionError):
         return False  # writing the registers back may still succeed
 
 
-async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images, stored: bool) -> bool:
+async def _write_back(link: RegisterLink, bundle: td.Bundle, snapshot: Snapshot, known: Images, stored: bool) -> bool:
     acknowledged, theirs = True, False
     try:
         await run_sequence(link, bundle, "unlock")
@@ -138,7 +136,7 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, kn
     return restarted
 
 
-async def _require_equal(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
+async def _require_equal(link: RegisterLink, bundle: td.Bundle, snapshot: Snapshot) -> None:
     if wrong := await differing(link, bundle, snapshot):
         raise ProvisionError(f"of the old calibration, {', '.join(wrong)} will not come back")
 
@@ -161,7 +159,7 @@ class Provisioning:
     """
 
     link: RegisterLink
-    bundle: Bundle
+    bundle: td.Bundle
     image: RegisterImage
     unit: str
     folder: Path
@@ -334,7 +332,7 @@ class Provisioning:
                 self.held.saw(Observation.READ_BACK)
                 self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
                 await self._prove()
-        except (DriverError, StationError) as trouble:
+        except (td.DriverError, StationError) as trouble:
             e = await to_its_end(self._named(trouble))
             await to_its_end(self._give_up())
             if not self.written and isinstance(e, ProvisionError):
@@ -502,7 +500,7 @@ class Provisioning:
         self.steps.append("reset")
         try:
             restart = await self._restart(self.image.raw, self.before.raw, self.found.raw)
-        except RegisterRefused:
+        except td.RegisterRefused:
             if self.power_cycle is None:
                 raise
             return
@@ -539,7 +537,7 @@ class Provisioning:
         if self.written or self.carried or self._store_asked:
             await self._undo()
         elif self._unlocked:
-            with suppress(DriverError, StationError):
+            with suppress(td.DriverError, StationError):
                 await self._require_same_unit()
                 await lock_quietly(self.link, self.bundle)
 
@@ -560,7 +558,7 @@ class Provisioning:
                 self.undoing_failed = str(e)
                 if not self.link.touched & set(self.before.raw):
                     self.held.now(*was)
-                with suppress(DriverError, StationError):
+                with suppress(td.DriverError, StationError):
                     await self._judge(lasting)
                 return
             else:
@@ -580,7 +578,7 @@ class Provisioning:
         """
         self.link.tolerate()
         self.undoing_failed = "two units answer; take one of them away, then restore"
-        with suppress(DriverError, StationError):
+        with suppress(td.DriverError, StationError):
             await lock_quietly(self.link, self.bundle)
             if self.resets:
                 await self._sequence("reset")
@@ -600,7 +598,7 @@ class Provisioning:
             await self.link.write(name, self.before.raw[name])
         await lock_quietly(self.link, self.bundle)
 
-    async def _named(self, e: DriverError | StationError) -> DriverError | StationError:
+    async def _named(self, e: td.DriverError | StationError) -> td.DriverError | StationError:
         """The error, with both serial numbers if two units answer."""
         if not isinstance(e, TwoAnswer):
             return e
@@ -609,7 +607,7 @@ class Provisioning:
             await require_alone(self.link, self.bundle)
         except TwoAnswer as named:
             return named
-        except DriverError:
+        except td.DriverError:
             pass
         return e
 
@@ -670,7 +668,7 @@ class Provisioning:
         await reconnect(self.link, self.bundle.profile)
 
     async def _times_stored(self) -> bytes | None:
-        name = self.bundle.profile.by_role(WRITE_COUNTER_ROLE)
+        name = self.bundle.profile.by_role(td.roles.WRITE_COUNTER_ROLE)
         return None if name is None else await self.link.read(name)
 
     def _by_counter(self, before: bytes | None, after: bytes | None) -> None:

@@ -11,22 +11,7 @@ from typing import Literal
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers import registers as codec
-from triaxcal_drivers.errors import ProfileError, RegisterValueError
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED, SCALE_FACTOR_RATIO, Bundle, Profile
-from triaxcal_drivers.roles import (
-    AXES,
-    BIAS,
-    CRC_ROLE,
-    DATE_ROLE,
-    LINEAR,
-    MISALIGNMENT,
-    NOT_CALIBRATION,
-    REFERENCE_ROLE,
-    SCALE_FACTOR,
-    parsed,
-)
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import read_serial
 
@@ -66,17 +51,19 @@ class RegisterImage:
         return {word.register: word.raw for word in self.words}
 
 
-def calibration_registers(profile: Profile) -> tuple[str, ...]:
+def calibration_registers(profile: td.Profile) -> tuple[str, ...]:
     """Writable registers with a role in a calibration, in the profile's order,
     the checksum last."""
     names = [
-        name for name, r in profile.registers.items() if r.access == "rw" and r.role and r.role not in NOT_CALIBRATION
+        name
+        for name, r in profile.registers.items()
+        if r.access == "rw" and r.role and r.role not in td.roles.NOT_CALIBRATION
     ]
-    last = profile.crc.register_name if profile.crc else profile.by_role(CRC_ROLE)
+    last = profile.crc.register_name if profile.crc else profile.by_role(td.roles.CRC_ROLE)
     return tuple(sorted(names, key=lambda name: name == last))
 
 
-def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_days: int) -> RegisterImage:
+def build_image(profile: td.Profile, coefficients: Mapping[str, float], *, date_days: int) -> RegisterImage:
     """``coefficients`` by role, each in its register's unit, with
     ``reference_temperature`` among them; ``date_days`` since 1970-01-01.
 
@@ -86,7 +73,7 @@ def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_day
     effects) is missing, ProfileError where the checksum covers other registers.
     """
     names = calibration_registers(profile)
-    wanted = {**coefficients, DATE_ROLE: float(date_days)}
+    wanted = {**coefficients, td.roles.DATE_ROLE: float(date_days)}
     roles = {profile.registers[name].role for name in names}
     _refuse_gaps(roles, coefficients)
     checksum = profile.crc.register_name if profile.crc else None
@@ -97,35 +84,41 @@ def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_day
     return RegisterImage(tuple(words), tuple(role for role in coefficients if role not in roles))
 
 
-def image_of(profile: Profile, raw: Mapping[str, bytes]) -> RegisterImage:
+def image_of(profile: td.Profile, raw: Mapping[str, bytes]) -> RegisterImage:
     """The image whose raw bytes are known. Raises ProfileError for a register
     that the profile has not."""
     words = []
     for name, data in raw.items():
         if name not in profile.registers:
-            raise ProfileError(f"profile {profile.name}: no register named '{name}'")
+            raise td.ProfileError(f"profile {profile.name}: no register named '{name}'")
         register, value = profile.registers[name], profile.decode(name, data)
-        words.append(Word(name, register.role or "", data, value, value, register.unit, codec.step(register, value)))
+        words.append(
+            Word(name, register.role or "", data, value, value, register.unit, td.registers.step(register, value))
+        )
     return RegisterImage(tuple(words), ())
 
 
 def _refuse_gaps(roles: set[str], coefficients: Mapping[str, float]) -> None:
     """Zero is a fair value for an effect that is absent, but not for these."""
-    missing = [role for role in sorted(roles) if role.startswith(f"{SCALE_FACTOR}.") and role not in coefficients]
+    missing = [
+        role for role in sorted(roles) if role.startswith(f"{td.roles.SCALE_FACTOR}.") and role not in coefficients
+    ]
     thermal = [role for role, value in coefficients.items() if role.startswith("temperature_") and value]
-    if thermal and REFERENCE_ROLE in roles and REFERENCE_ROLE not in coefficients:
-        missing.append(f"{REFERENCE_ROLE} (of {thermal[0]})")
+    if thermal and td.roles.REFERENCE_ROLE in roles and td.roles.REFERENCE_ROLE not in coefficients:
+        missing.append(f"{td.roles.REFERENCE_ROLE} (of {thermal[0]})")
     if missing:
         raise InputError(f"calibration: no {', '.join(missing)}, which the device needs")
 
 
-def _word(profile: Profile, name: str, value: float) -> Word:
+def _word(profile: td.Profile, name: str, value: float) -> Word:
     register = profile.registers[name]
     raw = profile.encode(name, value)
-    return Word(name, register.role, raw, value, profile.decode(name, raw), register.unit, codec.step(register, value))
+    return Word(
+        name, register.role, raw, value, profile.decode(name, raw), register.unit, td.registers.step(register, value)
+    )
 
 
-def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
+def checksum_of(profile: td.Profile, raw: Mapping[str, bytes]) -> int:
     """The profile's checksum over registers' raw bytes (as on the wire), by
     name.
 
@@ -133,16 +126,16 @@ def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
     RegisterValueError where one holds no number or has a wrong length.
     """
     if profile.crc is None:
-        raise ProfileError(f"profile {profile.name}: crc: none is described")
+        raise td.ProfileError(f"profile {profile.name}: crc: none is described")
     for name in profile.crc.over:
         if name not in raw:
-            raise ProfileError(
+            raise td.ProfileError(
                 f"profile {profile.name}: crc: covers register {name}, which is no writable register with a role"
             )
         if not math.isfinite(profile.decode(name, raw[name])):
-            raise RegisterValueError(f"register {name}: {raw[name].hex()} is no number")
+            raise td.RegisterValueError(f"register {name}: {raw[name].hex()} is no number")
     covered = b"".join(profile.most_significant_first(raw[name]) for name in profile.crc.over)
-    return codec.crc(profile.crc.algorithm, covered)
+    return td.registers.crc(profile.crc.algorithm, covered)
 
 
 # What the device holds: its calibration registers as raw bytes.
@@ -162,7 +155,7 @@ class Snapshot:
         return tuple(name for name, raw in self.raw.items() if name in other and other[name] != raw)
 
 
-async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | None = None) -> Snapshot:
+async def take_snapshot(device: td.Device, bundle: td.Bundle, names: Iterable[str] | None = None) -> Snapshot:
     """Read ``names``, by default every calibration register. Raises
     RegisterRefused, DeviceSilent."""
     serial = await read_serial(device, bundle)
@@ -175,10 +168,10 @@ async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | N
 Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
-    MISALIGNMENT: (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
-    BIAS: (-20.0, 20.0),  # g: the full scale of the triads in question
-    REFERENCE_ROLE: (-273.15, 1000.0),  # °C
-    DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
+    td.roles.MISALIGNMENT: (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
+    td.roles.BIAS: (-20.0, 20.0),  # g: the full scale of the triads in question
+    td.roles.REFERENCE_ROLE: (-273.15, 1000.0),  # °C
+    td.roles.DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
 }
 EFFECT_BOUND = 10.0
 """g per g², per K and so on: a larger effect would exceed the measurement itself."""
@@ -202,14 +195,14 @@ def is_blank(snapshot: Snapshot) -> bool:
     return bool(held) and len(set(held)) == 1 and held[0] in (0x00, 0xFF)
 
 
-def unstable(profile: Profile, first: Snapshot, second: Snapshot) -> list[SanityWarning]:
+def unstable(profile: td.Profile, first: Snapshot, second: Snapshot) -> list[SanityWarning]:
     """Warnings of registers whose two readings in a row differ."""
     return [
         SanityWarning("unstable", name, profile.decode(name, second.raw[name])) for name in first.differing(second.raw)
     ]
 
 
-def sanity_warnings(profile: Profile, snapshot: Snapshot, image: RegisterImage) -> list[SanityWarning]:
+def sanity_warnings(profile: td.Profile, snapshot: Snapshot, image: RegisterImage) -> list[SanityWarning]:
     """Warnings of register values outside their limits, and of a wrong checksum;
     none for a blank device."""
     if is_blank(snapshot):
@@ -219,7 +212,7 @@ def sanity_warnings(profile: Profile, snapshot: Snapshot, image: RegisterImage) 
     return [*found, *_checksum(profile, snapshot)]
 
 
-def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) -> SanityWarning | None:
+def _of(profile: td.Profile, name: str, raw: bytes, wanted: Mapping[str, float]) -> SanityWarning | None:
     value = profile.decode(name, raw)
     if not math.isfinite(value):
         return SanityWarning("not_a_number", name, value)
@@ -228,31 +221,31 @@ def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) ->
     high = math.inf if register.maximum is None else register.maximum
     if not low <= value <= high:
         return SanityWarning("outside_limits", name, value, low, high)
-    role = parsed(register.role)
-    if role.quantity == SCALE_FACTOR:
+    role = td.roles.parsed(register.role)
+    if role.quantity == td.roles.SCALE_FACTOR:
         nominal = profile.output.nominal_scale_factor
         size = abs(nominal[role.axis] if nominal else wanted.get(name, math.nan))
-        low, high = size / SCALE_FACTOR_RATIO, size * SCALE_FACTOR_RATIO
+        low, high = size / td.SCALE_FACTOR_RATIO, size * td.SCALE_FACTOR_RATIO
         implausible = abs(value) < low or abs(value) > high
     else:
         low, high = BOUNDS.get(role.quantity, (-EFFECT_BOUND, EFFECT_BOUND))
-        implausible = role.quantity != CRC_ROLE and not low <= value <= high
+        implausible = role.quantity != td.roles.CRC_ROLE and not low <= value <= high
     return SanityWarning("implausible", name, value, low, high) if implausible else None
 
 
-def fits_its_checksum(profile: Profile, snapshot: Snapshot) -> bool:
+def fits_its_checksum(profile: td.Profile, snapshot: Snapshot) -> bool:
     """Whether the device has a checksum, and it matches the registers."""
     return profile.crc is not None and not _checksum(profile, snapshot)
 
 
-def _checksum(profile: Profile, snapshot: Snapshot) -> Sequence[SanityWarning]:
+def _checksum(profile: td.Profile, snapshot: Snapshot) -> Sequence[SanityWarning]:
     if profile.crc is None or profile.crc.register_name not in snapshot.raw:
         return []
     name = profile.crc.register_name
     held = profile.decode(name, snapshot.raw[name])
     try:
         right = float(checksum_of(profile, snapshot.raw))
-    except (RegisterValueError, ProfileError, OverflowError, ValueError):  # a register holds no number
+    except (td.RegisterValueError, td.ProfileError, OverflowError, ValueError):  # a register holds no number
         right = math.nan
     return [] if held == right else [SanityWarning("checksum", name, held, right, right)]
 
@@ -267,11 +260,11 @@ LEAST = 3
 """Fewer samples or poses are no evidence."""
 
 
-def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] | None:
+def sensor_in(profile: td.Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] | None:
     """The sensor that the registers describe, and its reference temperature in
     °C; None where they describe none."""
     held = {r.role: profile.decode(n, snapshot.raw[n]) for n, r in profile.registers.items() if n in snapshot.raw}
-    linear = [[held.get(f"{name}.{axis}") for axis in AXES] for name in LINEAR]
+    linear = [[held.get(f"{name}.{axis}") for axis in td.roles.AXES] for name in td.roles.LINEAR]
     if any(value is None or not np.isfinite(value) for values in linear for value in values):
         return None
     scale_factor, misalignment, bias = (np.array(values, dtype=float) for values in linear)
@@ -279,15 +272,19 @@ def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[tc.Sensor, float] |
         return None
     effects: dict[str, dict[str, float]] = {}
     for role, value in held.items():
-        name, coefficient = parsed(role)
-        if coefficient and name not in LINEAR:
+        name, coefficient = td.roles.parsed(role)
+        if coefficient and name not in td.roles.LINEAR:
             effects.setdefault(name, {})[coefficient] = value
     found = [tc.effects.effect_of(name, values) for name, values in effects.items() if any(values.values())]
-    return tc.Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(REFERENCE_ROLE, 0.0)
+    return tc.Sensor(scale_factor, misalignment, bias, tuple(found)), held.get(td.roles.REFERENCE_ROLE, 0.0)
 
 
 def departure_g(
-    profile: Profile, snapshot: Snapshot, readings: tc.Floats, corrected: tc.Floats, channels: Mapping[str, tc.Floats]
+    profile: td.Profile,
+    snapshot: Snapshot,
+    readings: tc.Floats,
+    corrected: tc.Floats,
+    channels: Mapping[str, tc.Floats],
 ) -> float | None:
     """Median distance in g of the ``corrected`` output (n,3) from what the
     registers make of the ``readings`` (n,3) of the same moments; ``channels``
@@ -322,15 +319,15 @@ class ReadingsNotStated(tc.Refused):
     Raised before anything is written."""
 
 
-def leaves_open(profile: Profile) -> bool:
+def leaves_open(profile: td.Profile) -> bool:
     """Whether the profile does not say if the readings are those before the
     device's correction: by a second stream for the corrected ones, or by
     ``correction.readings``."""
     stated = profile.correction is not None and profile.correction.readings is not None
-    return CORRECTED not in profile.streams and not stated and bool(_correcting(profile))
+    return td.CORRECTED not in profile.streams and not stated and bool(_correcting(profile))
 
 
-def require_readings_before(profile: Profile, snapshot: Snapshot) -> None:
+def require_readings_before(profile: td.Profile, snapshot: Snapshot) -> None:
     """Raises ReadingsNotStated where the profile leaves open whether the readings are
     corrected, and registers of the ``snapshot`` would correct them."""
     if not leaves_open(profile) or not (names := not_neutral(profile, snapshot)):
@@ -343,7 +340,7 @@ def require_readings_before(profile: Profile, snapshot: Snapshot) -> None:
     )
 
 
-def not_neutral(profile: Profile, snapshot: Snapshot) -> tuple[str, ...]:
+def not_neutral(profile: td.Profile, snapshot: Snapshot) -> tuple[str, ...]:
     """The registers of ``snapshot`` by which the device would change its
     readings; none of a blank device."""
     held = {name: snapshot.raw[name] for name in _correcting(profile) if name in snapshot.raw}
@@ -352,27 +349,27 @@ def not_neutral(profile: Profile, snapshot: Snapshot) -> tuple[str, ...]:
     return tuple(name for name, raw in held.items() if not _is_neutral(profile, name, raw))
 
 
-def _correcting(profile: Profile) -> tuple[str, ...]:
+def _correcting(profile: td.Profile) -> tuple[str, ...]:
     """The calibration registers that change readings by themselves."""
-    labels = (CRC_ROLE, DATE_ROLE, REFERENCE_ROLE)
+    labels = (td.roles.CRC_ROLE, td.roles.DATE_ROLE, td.roles.REFERENCE_ROLE)
     return tuple(name for name in calibration_registers(profile) if profile.registers[name].role not in labels)
 
 
-def _is_neutral(profile: Profile, name: str, raw: bytes) -> bool:
+def _is_neutral(profile: td.Profile, name: str, raw: bytes) -> bool:
     register, value = profile.registers[name], profile.decode(name, raw)
-    role = parsed(register.role)
-    if role.quantity != SCALE_FACTOR:
+    role = td.roles.parsed(register.role)
+    if role.quantity != td.roles.SCALE_FACTOR:
         return value == _nearest(profile, name, 0.0)
     # The device divides by it. Who wrote the nominal one may have rounded it
     # otherwise, by a step of the register at most.
     nominal = profile.output.nominal_scale_factor
     neutral = [1.0, *([nominal[role.axis]] if nominal else [])]
-    return any(abs(value - _nearest(profile, name, n)) <= codec.step(register, n) * (1 + 1e-9) for n in neutral)
+    return any(abs(value - _nearest(profile, name, n)) <= td.registers.step(register, n) * (1 + 1e-9) for n in neutral)
 
 
-def _nearest(profile: Profile, name: str, value: float) -> float:
+def _nearest(profile: td.Profile, name: str, value: float) -> float:
     """Nearest register value to ``value``."""
     try:
         return profile.decode(name, profile.encode(name, value))
-    except RegisterValueError:  # outside its limits
+    except td.RegisterValueError:  # outside its limits
         return value

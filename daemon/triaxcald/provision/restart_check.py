@@ -7,8 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
-from triaxcal_drivers.errors import DriverError, RegisterRefused
-from triaxcal_drivers.profile import Bundle, Profile, WriteStep
+import triaxcal_drivers as td
 from triaxcald.errors import ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity
@@ -49,7 +48,7 @@ class _Probe:
 
 
 async def checked_restart(
-    link: RegisterLink, bundle: Bundle, serial: str | None, *known: Mapping[str, bytes]
+    link: RegisterLink, bundle: td.Bundle, serial: str | None, *known: Mapping[str, bytes]
 ) -> Restart:
     """Restart the unit of that serial number, and check that it restarted.
 
@@ -74,7 +73,7 @@ async def checked_restart(
         restart, probe = await _restarted(link, bundle, serial, probe, known)
     except TwoAnswer:  # both units may hold the probe, and only a restart removes it from both
         link.tolerate()
-        with suppress(DriverError, StationError):
+        with suppress(td.DriverError, StationError):
             await lock_quietly(link, bundle)
             await run_sequence(link, bundle, "reset")
         raise
@@ -83,8 +82,8 @@ async def checked_restart(
             raise
         try:
             await _put_back(link, bundle, serial, probe)
-        except (DriverError, StationError):
-            if isinstance(e, RegisterRefused):  # the device answers, but keeps the probe
+        except (td.DriverError, StationError):
+            if isinstance(e, td.RegisterRefused):  # the device answers, but keeps the probe
                 raise
         raise
     if not restart.probe_gone and await _read_again(link, bundle.profile, probe.name) == probe.value:
@@ -95,7 +94,7 @@ async def checked_restart(
 
 
 async def _restarted(
-    link: RegisterLink, bundle: Bundle, serial: str | None, probe: _Probe, known: Collection[Mapping[str, bytes]]
+    link: RegisterLink, bundle: td.Bundle, serial: str | None, probe: _Probe, known: Collection[Mapping[str, bytes]]
 ) -> tuple[Restart, _Probe]:
     """Send the restart command until the probe is gone, `ATTEMPTS` times at most;
     the result and the last probe."""
@@ -116,12 +115,12 @@ async def _restarted(
         used.append(other)
         try:
             probe = _Probe(probe.name, probe.original, other, await _put(link, bundle, serial, probe.name, other))
-        except RegisterRefused:
+        except td.RegisterRefused:
             return Restart(acknowledged, probe_gone=False), probe
 
 
 async def _with_probe(
-    link: RegisterLink, bundle: Bundle, serial: str | None, known: Collection[Mapping[str, bytes]]
+    link: RegisterLink, bundle: td.Bundle, serial: str | None, known: Collection[Mapping[str, bytes]]
 ) -> _Probe | None:
     """Write a probe. None if no register may get another value, or if the device
     refuses all values offered."""
@@ -131,20 +130,20 @@ async def _with_probe(
         original = await link.read(name)
         value = next(_others(bundle.profile, name, original, known), None)
         if value is not None:
-            with suppress(RegisterRefused):
+            with suppress(td.RegisterRefused):
                 return _Probe(name, original, value, await _put(link, bundle, serial, name, value))
     return None
 
 
 def _others(
-    profile: Profile, name: str, held: bytes, known: Collection[Mapping[str, bytes]], used: Collection[bytes] = ()
+    profile: td.Profile, name: str, held: bytes, known: Collection[Mapping[str, bytes]], used: Collection[bytes] = ()
 ) -> Iterator[bytes]:
     """Candidate values of a probe: neither stored nor used before."""
     taken = [*used, *(registers.get(name) for registers in known)]
     return (other for other in neighbouring_values(profile, name, held) if other not in taken)
 
 
-def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator[str]:
+def _names(profile: td.Profile, known: Collection[Mapping[str, bytes]]) -> Iterator[str]:
     """Candidate registers of a probe: first those that differ between the images and
     are written anyway, never the checksum."""
     checksum = profile.crc.register_name if profile.crc else None
@@ -152,7 +151,7 @@ def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator
     yield from sorted(names, key=lambda name: len({registers.get(name) for registers in known}) == 1)
 
 
-def may_probe(profile: Profile) -> bool:
+def may_probe(profile: td.Profile) -> bool:
     """Whether a register may get a probe: no write lasts without the store, and no
     other sequence stores."""
     elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset")
@@ -160,20 +159,20 @@ def may_probe(profile: Profile) -> bool:
     return bool(store) and not store & elsewhere
 
 
-def own_steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+def own_steps(profile: td.Profile, label: Label) -> set[tuple[str, bytes]]:
     """The writes of a sequence that no other sequence has; all of its writes if
     there are none. A key is such a shared write."""
     mine = writes_of(profile, label)
     return mine - {step for other in SEQUENCES if other != label for step in writes_of(profile, other)} or mine
 
 
-def writes_of(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+def writes_of(profile: td.Profile, label: Label) -> set[tuple[str, bytes]]:
     """The writes of a sequence: registers and raw values."""
     steps = getattr(profile.sequences, label)
-    return {(s.write, profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
+    return {(s.write, profile.encode(s.write, s.value)) for s in steps if isinstance(s, td.WriteStep)}
 
 
-def neighbouring_values(profile: Profile, name: str, raw: bytes) -> list[bytes]:
+def neighbouring_values(profile: td.Profile, name: str, raw: bytes) -> list[bytes]:
     """Values within the register's limits that differ from ``raw`` by one of
     the three lowest bits, the nearest first. The lowest bits lie in the last
     byte, or in the first one if the least significant byte comes first."""
@@ -188,7 +187,7 @@ def neighbouring_values(profile: Profile, name: str, raw: bytes) -> list[bytes]:
     return [other for _, other in allowed[: len(BITS)]]
 
 
-async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str, raw: bytes) -> bool:
+async def _put(link: RegisterLink, bundle: td.Bundle, serial: str | None, name: str, raw: bytes) -> bool:
     """Write a value in use; whether the register read it back.
 
     Raises WrongUnit, with nothing written; RegisterRefused of the write.
@@ -199,7 +198,7 @@ async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str
         await check_identity(link, bundle, serial)  # right before the one write that could reach another unit
     except (WrongUnit, TwoAnswer):
         raise
-    except (*NO_CONTACT, RegisterRefused, StationError):
+    except (*NO_CONTACT, td.RegisterRefused, StationError):
         link.refresh()
         return False
     link.probed.append(name)
@@ -217,18 +216,18 @@ async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str
 async def _is(link: RegisterLink, name: str, raw: bytes) -> bool:
     try:
         return await link.read(name) == raw
-    except (*NO_CONTACT, RegisterRefused):
+    except (*NO_CONTACT, td.RegisterRefused):
         return False
 
 
-async def _put_back(link: RegisterLink, bundle: Bundle, serial: str | None, probe: _Probe) -> None:
-    with suppress(RegisterRefused):
+async def _put_back(link: RegisterLink, bundle: td.Bundle, serial: str | None, probe: _Probe) -> None:
+    with suppress(td.RegisterRefused):
         if await _put(link, bundle, serial, probe.name, probe.original):
             return
     raise ProvisionError(f"register {probe.name} does not take its value again")
 
 
-async def _read_again(link: RegisterLink, profile: Profile, name: str) -> bytes:
+async def _read_again(link: RegisterLink, profile: td.Profile, name: str) -> bytes:
     """Read after a restart; a device that has just started may need a new
     connection."""
     try:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Literal
 
-from triaxcal_drivers.errors import BusError, DeviceBusy, DriverError, RegisterRefused
-from triaxcal_drivers.profile import Bundle, PollStep, Profile, ReconnectStep, Step, WaitStep, WriteStep
+import triaxcal_drivers as td
 from triaxcald.errors import StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 
@@ -23,7 +22,7 @@ class SequenceStalled(StationError):
     """A register did not take the value that the sequence waits for."""
 
 
-async def run_sequence(link: RegisterLink, bundle: Bundle, label: Label) -> bool:
+async def run_sequence(link: RegisterLink, bundle: td.Bundle, label: Label) -> bool:
     """Carry out ``label``'s steps in order; none where the profile gives none.
     Whether every write was acknowledged.
 
@@ -36,45 +35,45 @@ async def run_sequence(link: RegisterLink, bundle: Bundle, label: Label) -> bool
     return await run_steps(link, bundle, label, getattr(bundle.profile.sequences, label))
 
 
-async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Sequence[Step]) -> bool:
+async def run_steps(link: RegisterLink, bundle: td.Bundle, label: Label, steps: Sequence[td.Step]) -> bool:
     acknowledged = True
     for step, following in zip(steps, (*steps[1:], None), strict=False):
         match step:
-            case WriteStep():
-                restarts = isinstance(following, (WaitStep, ReconnectStep)) and label == "reset"
+            case td.WriteStep():
+                restarts = isinstance(following, (td.WaitStep, td.ReconnectStep)) and label == "reset"
                 acknowledged &= await _written(link, bundle, step, open_ended=label == "store" or restarts)
-            case WaitStep():
+            case td.WaitStep():
                 await link.clock.sleep(step.wait_s)
-            case PollStep():
+            case td.PollStep():
                 await _poll(link, bundle.profile, label, step)
-            case ReconnectStep():
+            case td.ReconnectStep():
                 await reconnect(link, bundle.profile, step.timeout_s)
     return acknowledged
 
 
-async def lock_quietly(link: RegisterLink, bundle: Bundle) -> None:
+async def lock_quietly(link: RegisterLink, bundle: td.Bundle) -> None:
     """Lock the device if it accepts. A restart locks it too, and the stored values do
     not depend on it."""
-    with suppress(DriverError, StationError):
+    with suppress(td.DriverError, StationError):
         await run_sequence(link, bundle, "lock")
 
 
-async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_ended: bool) -> bool:
+async def _written(link: RegisterLink, bundle: td.Bundle, step: td.WriteStep, *, open_ended: bool) -> bool:
     """Whether the write was acknowledged; with ``open_ended`` a missing
     acknowledgement is no error."""
     raw = bundle.profile.encode(step.write, step.value)
     try:
         await link.write(step.write, raw, timeout_s=step.timeout_s)
-    except (*NO_CONTACT, DeviceBusy) as e:
+    except (*NO_CONTACT, td.DeviceBusy) as e:
         if not open_ended:
             raise
-        if isinstance(e, BusError):
+        if isinstance(e, td.BusError):
             await link.renew()
         return False
     return True
 
 
-async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollStep) -> None:
+async def _poll(link: RegisterLink, profile: td.Profile, label: Label, step: td.PollStep) -> None:
     deadline_s = link.clock.now_s() + step.timeout_s
     while True:
         try:
@@ -86,7 +85,7 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
             )
             if value == step.until:
                 return
-        except (*NO_CONTACT, RegisterRefused) as e:  # a busy device may be silent or refuse for a while
+        except (*NO_CONTACT, td.RegisterRefused) as e:  # a busy device may be silent or refuse for a while
             late = e
         if link.clock.now_s() >= deadline_s:
             raise late
@@ -98,7 +97,7 @@ def _shown(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
 
 
-async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | None = None) -> None:
+async def reconnect(link: RegisterLink, profile: td.Profile, timeout_s: float | None = None) -> None:
     """Close and open until the device answers, for `RECONNECT_S` where nothing
     else is said.
 
@@ -113,13 +112,13 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
             if register := contact_register(profile):
                 await link.read_once(register)
             return
-        except (*NO_CONTACT, RegisterRefused):
+        except (*NO_CONTACT, td.RegisterRefused):
             if link.clock.now_s() >= deadline_s:
                 raise
         await link.clock.sleep(RETRY_S)
 
 
-def contact_register(profile: Profile) -> str | None:
+def contact_register(profile: td.Profile) -> str | None:
     """The register that proves contact with the device: opening may succeed without
     a device on the bus."""
     return profile.identity.serial_register or next(iter(profile.identity.expect), None)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.interface import RawBatch, RawFlag
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import BUS_PHASE, BUS_RECORD, RAW
@@ -60,7 +60,7 @@ def is_of_bus(recording: Contents) -> bool:
     return BUS_RECORD in recording.metadata
 
 
-def bus_frames(recording: Contents) -> Iterator[tuple[Channel, RawBatch]]:
+def bus_frames(recording: Contents) -> Iterator[tuple[Channel, td.RawBatch]]:
     """The frames of a bus recording by channel, in the order in which they were
     recorded. Raises RecordingError."""
     return ((channel_of(phase), batch) for phase, batch in recording.raw_batches() if phase.startswith(BUS_PHASE))
@@ -109,16 +109,16 @@ class _Channel:
         self._counts: dict[str, int] = dict.fromkeys(("frames", "remote", "errors", "sent", "gaps"), 0)
         self._span_ns: tuple[int, int] | None = None
 
-    def feed(self, batch: RawBatch) -> None:
-        error = (batch.flags & RawFlag.ERROR) != 0
-        fd = (batch.flags & RawFlag.FD) != 0
+    def feed(self, batch: td.RawBatch) -> None:
+        error = (batch.flags & td.RawFlag.ERROR) != 0
+        fd = (batch.flags & td.RawFlag.FD) != 0
         self._identifiers = np.union1d(self._identifiers, batch.identifiers[~error])
         seen: Mapping[str, Any] = {
             "frames": ~error,
-            "remote": ((batch.flags & RawFlag.REMOTE) != 0) & ~fd & ~error,
+            "remote": ((batch.flags & td.RawFlag.REMOTE) != 0) & ~fd & ~error,
             "errors": error,
-            "sent": (batch.flags & RawFlag.SENT) != 0,
-            "gaps": (batch.flags & RawFlag.LOST_BEFORE) != 0,
+            "sent": (batch.flags & td.RawFlag.SENT) != 0,
+            "gaps": (batch.flags & td.RawFlag.LOST_BEFORE) != 0,
         }
         for name, which in seen.items():
             self._counts[name] += int(np.count_nonzero(which))

@@ -11,14 +11,16 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.interface import RawBatch, RawFlag
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording.bus import Channel, channel_of, phase_of
 from triaxcald.recording.contents import Contents
 
 # As plain numbers: an IntFlag takes longer than all else that is done to a message.
-_EXTENDED, _REMOTE, _ERROR, _FD = (int(f) for f in (RawFlag.EXTENDED_ID, RawFlag.REMOTE, RawFlag.ERROR, RawFlag.FD))
-_SWITCH, _SENT = int(RawFlag.BIT_RATE_SWITCH), int(RawFlag.SENT)
+_EXTENDED, _REMOTE, _ERROR, _FD = (
+    int(f) for f in (td.RawFlag.EXTENDED_ID, td.RawFlag.REMOTE, td.RawFlag.ERROR, td.RawFlag.FD)
+)
+_SWITCH, _SENT = int(td.RawFlag.BIT_RATE_SWITCH), int(td.RawFlag.SENT)
 _LATEST_S = 2**63 // 10**9  # what fits into nanoseconds of 64 bits: the year 2262
 
 Row = tuple[float, int, int, bytes, Any]
@@ -47,7 +49,7 @@ def row_of(message: can.Message) -> Row:
     return message.timestamp, message.arbitration_id, flags, data, message.channel
 
 
-def batches_of(values: Sequence[Any]) -> Iterator[tuple[str, RawBatch]]:
+def batches_of(values: Sequence[Any]) -> Iterator[tuple[str, td.RawBatch]]:
     """One batch for each channel, with its phase, of the values of all rows one
     after the other. Raises ValueError where a message has no time or no
     identifier that a recording can hold.
@@ -68,7 +70,7 @@ def batches_of(values: Sequence[Any]) -> Iterator[tuple[str, RawBatch]]:
 
 def _batch_of(
     seconds: Sequence[float], sources: Sequence[int], flags: Sequence[int], data: Sequence[bytes]
-) -> RawBatch:
+) -> td.RawBatch:
     time_s = np.array(seconds, dtype=np.float64)
     if not np.all((time_s >= 0) & (time_s < _LATEST_S)):
         raise ValueError("a message without a time, expected seconds from 0 on")
@@ -79,7 +81,7 @@ def _batch_of(
     # Apart, as their product has not the digits for both.
     time_ns = whole.astype(np.int64) * 10**9 + np.rint((time_s - whole) * 1e9).astype(np.int64)
     lengths = np.fromiter(map(len, data), dtype=np.uint16, count=len(data))
-    return RawBatch(time_ns, source.astype(np.uint32), np.array(flags, dtype=np.uint8), lengths, b"".join(data))
+    return td.RawBatch(time_ns, source.astype(np.uint32), np.array(flags, dtype=np.uint8), lengths, b"".join(data))
 
 
 def messages_of(recording: Contents) -> Iterator[can.Message]:
@@ -87,7 +89,7 @@ def messages_of(recording: Contents) -> Iterator[can.Message]:
     in which they came, channels among each other by their times; none that is
     unconfirmed. Raises RecordingError."""
     _require_can(recording)
-    together: dict[str, RawBatch] = {}
+    together: dict[str, td.RawBatch] = {}
     for phase, batch in recording.raw_batches():
         if batch.unconfirmed:
             continue
@@ -108,12 +110,12 @@ def _require_can(recording: Contents) -> None:
         raise RecordingError(f"{recording.name}: records of a unit on {driver}, expected CAN frames")
 
 
-def _merged(batches: dict[str, RawBatch]) -> Iterator[can.Message]:
+def _merged(batches: dict[str, td.RawBatch]) -> Iterator[can.Message]:
     each: list[Iterable[can.Message]] = [_messages(channel_of(phase), batch) for phase, batch in batches.items()]
     return heapq.merge(*each, key=lambda m: m.timestamp) if len(each) > 1 else iter(each[0] if each else ())
 
 
-def _messages(channel: Channel, batch: RawBatch) -> Iterator[can.Message]:
+def _messages(channel: Channel, batch: td.RawBatch) -> Iterator[can.Message]:
     seconds, rest_ns = np.divmod(batch.time_ns, 10**9)
     ends = np.cumsum(batch.length, dtype=np.int64).tolist()
     begin, payload, message = 0, bytearray(batch.payload), can.Message

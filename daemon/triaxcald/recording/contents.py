@@ -11,7 +11,7 @@ from typing import NamedTuple, Self, TypeVar
 
 from mcap.records import Message
 
-from triaxcal_drivers.interface import RawBatch
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.raw_batch import Fields, batch_of, decode_raw, fields_of
@@ -75,24 +75,24 @@ class Contents(ABC):
         """In the order in which they began."""
         return list(dict.fromkeys(phase for phase, _ in self.joined_batches()))
 
-    def raw(self, phase: str) -> Iterator[RawBatch]:
+    def raw(self, phase: str) -> Iterator[td.RawBatch]:
         """The phase's raw records in the order in which they came, some
         `JOINED` at a time: a live bus hands out few. Without those that are
         unconfirmed: nothing is computed from them."""
         return (batch for _, batch in self._raw(phase.encode()) if not batch.unconfirmed)
 
-    def joined_batches(self) -> Iterator[tuple[str, RawBatch]]:
+    def joined_batches(self) -> Iterator[tuple[str, td.RawBatch]]:
         """All raw records with their phase, likewise, but also those that are
         unconfirmed; the batch says so."""
         return self._raw()
 
-    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
+    def raw_batches(self) -> Iterator[tuple[str, td.RawBatch]]:
         """The same in the batches in which they were recorded, of which the
         phases take turns."""
         for first, phase, batch in self._decoded(schema.RAW, decode_raw):
             yield phase, batch if self.is_confirmed(first) else replace(batch, unconfirmed=True)
 
-    def _raw(self, phase: bytes | None = None) -> Iterator[tuple[str, RawBatch]]:
+    def _raw(self, phase: bytes | None = None) -> Iterator[tuple[str, td.RawBatch]]:
         waiting, records, size = list[tuple[int, Fields]](), 0, 0
         for message, fields in self._read(schema.RAW, fields_of):
             if phase is not None and fields.phase != phase:
@@ -111,7 +111,7 @@ class Contents(ABC):
     def _belong_together(self, one: Fields, other: Fields) -> bool:
         return one.phase == other.phase and self.is_confirmed(one.first) == self.is_confirmed(other.first)
 
-    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> tuple[str, RawBatch]:
+    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> tuple[str, td.RawBatch]:
         """Of messages of one phase that are all confirmed, or none of them.
         Raises RecordingError, which names the message at fault."""
         time_ns, first = waiting[0]

@@ -11,7 +11,7 @@ from typing import Any, TextIO
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.interface import SampleBlock
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 
 
@@ -25,7 +25,7 @@ class Rows:
     columns: Mapping[str, Any]
 
     @classmethod
-    def of(cls, block: SampleBlock) -> Rows:
+    def of(cls, block: td.SampleBlock) -> Rows:
         outputs = dict(zip(("ux", "uy", "uz"), block.readings.T, strict=True))
         return cls(block.time_ns, outputs | dict(block.channels))
 

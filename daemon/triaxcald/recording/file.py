@@ -14,8 +14,7 @@ from typing import BinaryIO, Literal
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.interface import RawBatch, SampleBlock
+import triaxcal_drivers as td
 from triaxcald.errors import DiskError, ProvisionError, TwoAnswer
 from triaxcald.files import exists_already, synchronise
 from triaxcald.recording import disk, schema
@@ -96,7 +95,7 @@ class RecordingFile:
         """The time of what is told of the recording itself."""
         return self.span_ns[1] if self._head.of_the_past and self.span_ns else self._clock_ns()
 
-    def raw(self, phase: str, first: int, batch: RawBatch) -> None:
+    def raw(self, phase: str, first: int, batch: td.RawBatch) -> None:
         if self._begun_ns is not None and len(batch):
             self._tell_begun(min(self._begun_ns, int(batch.time_ns.min())))
         if len(batch) and self._waiting_ns is None:
@@ -113,7 +112,7 @@ class RecordingFile:
             earlier = self.span_ns or (begin, end)
             self.span_ns = min(earlier[0], begin), max(earlier[1], end)
 
-    def preview(self, topic: str, block: SampleBlock, picked: Sequence[int]) -> None:
+    def preview(self, topic: str, block: td.SampleBlock, picked: Sequence[int]) -> None:
         for i in picked:
             self._add(topic, int(block.time_ns[i]), self._head.preview.encode(block, i))
 
@@ -268,7 +267,7 @@ def ended_because(error: BaseException | None, of: Kind = "unit") -> EndedBecaus
             return "disk"
         case asyncio.CancelledError() | KeyboardInterrupt():
             return "signal"
-        case DriverError() | ProvisionError() | TwoAnswer():
+        case td.DriverError() | ProvisionError() | TwoAnswer():
             return "unit gave up" if of == "unit" else "bus gave up"
         case _:
             return "failed"

@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from triaxcal_drivers.files import read_whole
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.files import write_durably
 
@@ -137,7 +137,7 @@ def load_manifest(path: Path) -> Manifest:
 def parsed_manifest(path: Path) -> Manifest:
     """As `load_manifest`. Raises RecordingError, which says only what is wrong."""
     try:
-        document = json.loads(read_whole(path, MANIFEST_MOST))
+        document = json.loads(td.files.read_whole(path, MANIFEST_MOST))
     except OSError as e:
         raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
     except (ValueError, RecursionError) as e:

@@ -38,8 +38,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from triaxcal_drivers.files import HEAD as HEAD_LOOKED_AT
-from triaxcal_drivers.files import kind
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -102,13 +101,13 @@ def check_magic(stream: BinaryIO, name: str) -> None:
     """Check the magic. Raises CutShort if the file ends inside it, RecordingError if it
     is another file."""
     stream.seek(0)
-    head = stream.read(HEAD_LOOKED_AT)
+    head = stream.read(td.files.HEAD)
     magic = head[: len(MAGIC)]
     if magic == MAGIC:
         return
     if MAGIC.startswith(magic):
         raise CutShort(name, 0, "the file ends")
-    raise RecordingError(f"{name}: not an MCAP file but {kind(head)}, expected a recording (.mcap)")
+    raise RecordingError(f"{name}: not an MCAP file but {td.files.kind(head)}, expected a recording (.mcap)")
 
 
 def size_of(stream: BinaryIO) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.interface import RawBatch
+import triaxcal_drivers as td
 from triaxcald.recording import schema
 
 _STEP_MOST_NS = 2**31 - 1
@@ -41,7 +41,7 @@ _COLUMNS: Mapping[str, str] = {"time_ns": "<u8", "source": "<u4", "length": "<u4
 _WIDTHS = {name: np.dtype(kind).itemsize for name, kind in _COLUMNS.items()}
 
 
-def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
+def encode_raw(first: int, phase: str, batch: td.RawBatch) -> bytes:
     """``first`` is the running index of the batch's first record among all that
     were offered.
 
@@ -69,7 +69,7 @@ def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
     return bytes(message.SerializeToString())
 
 
-def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
+def decode_raw(data: bytes) -> tuple[int, str, td.RawBatch]:
     """(running index of the first record, phase, batch). Raises ValueError
     where ``data`` is none."""
     fields = fields_of(data)
@@ -93,7 +93,7 @@ def fields_of(data: bytes) -> Fields:
     return _of_another_writer(data)
 
 
-def batch_of(messages: Sequence[Fields]) -> RawBatch:
+def batch_of(messages: Sequence[Fields]) -> td.RawBatch:
     """The records of messages, one after the other. Raises ValueError where one
     of them does not hold what it should."""
     time_ns = _times_ns(messages[0]) if len(messages) == 1 else _all_times_ns(messages)
@@ -104,7 +104,7 @@ def batch_of(messages: Sequence[Fields]) -> RawBatch:
     length = np.frombuffer(b"".join(m.length for m in messages), dtype="<u4")
     if np.any(length > np.iinfo(np.uint16).max):
         raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")
-    batch = RawBatch(
+    batch = td.RawBatch(
         time_ns,
         np.frombuffer(b"".join(m.source for m in messages), dtype="<u4").astype(np.uint32),
         np.frombuffer(b"".join(m.flags for m in messages), dtype=np.uint8),

@@ -12,7 +12,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
 
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.contents import Contents, TopicMessage
@@ -107,7 +107,7 @@ class Recording(Contents):
     @classmethod
     def open(cls, path: Path, *, unfinished: bool = False) -> Recording:
         try:
-            stream = open_file(path)
+            stream = td.files.open_file(path)
         except OSError as e:
             raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
         try:

@@ -23,7 +23,7 @@ from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Message, Metad
 from mcap.records import Metadata as MetadataRecord
 
 import triaxcal as tc
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.files import unused
 from triaxcald.recording import schema
@@ -223,7 +223,7 @@ def _nothing_reached(path: Path) -> bool:
     """Whether of this file the disk has its name alone: the power failed right
     after it was created."""
     try:
-        with open_file(path) as stream:
+        with td.files.open_file(path) as stream:
             return written_to(stream, size_of(stream)) == 0
     except PermissionError:
         return False
@@ -250,7 +250,7 @@ def _by_records(path: Path, segment: Segment) -> Segment:
 def _told(path: Path) -> Told | None:
     """What the file says of its place among the segments; empty where it says
     nothing, None where it cannot be read."""
-    with suppress(RecordingError, OSError), open_file(path) as stream:
+    with suppress(RecordingError, OSError), td.files.open_file(path) as stream:
         check_magic(stream, str(path))
         size, offset = size_of(stream), len(MAGIC)
         # The metadata stand before the first chunk.
@@ -281,7 +281,7 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
     begin and end: to read all of a week of segments would take minutes. None
     where the whole file has to be read. Raises RecordingError."""
     try:
-        with open_file(path) as stream:
+        with td.files.open_file(path) as stream:
             name, size = str(path), size_of(stream)
             summary = _summary(stream, name, size)
             if summary is None or schema.RAW_RECORD not in summary.metadata or schema.UNCONFIRMED in summary.metadata:

@@ -16,7 +16,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
 import triaxcal as tc
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.files import exists_already, new_file
 from triaxcald.recording import schema
@@ -235,7 +235,7 @@ def recover(path: Path, out: Path) -> Recovery:
     if is_manifest(path):
         raise RecordingError(f"{path}: is a manifest; mend each segment that it says is cut short or damaged")
     try:
-        with open_file(path) as source:
+        with td.files.open_file(path) as source:
             damaged = DamagedFile(source, str(path))
             return _write(damaged, path.name, out)
     except FileExistsError:

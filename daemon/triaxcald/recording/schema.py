@@ -21,8 +21,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
-from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcal_drivers.profile import Profile
+import triaxcal_drivers as td
 
 FORMAT = "triaxcal.recording/1"
 FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_WITH where it is of a run
@@ -188,7 +187,7 @@ def preview_schema(channels: Sequence[str]) -> Schema:
     return _schema("Preview", vector + named)
 
 
-def preview_channels(profile: Profile) -> list[str]:
+def preview_channels(profile: td.Profile) -> list[str]:
     """Auxiliary channels that the previews of a recording have beside the three
     outputs."""
     names: dict[str, None] = {}
@@ -246,7 +245,7 @@ def parse(name: str, data: bytes) -> Any:
         raise ValueError(f"not a message {name}") from e
 
 
-def cut(batch: RawBatch, records: int = MAX_RECORDS) -> Iterator[RawBatch]:
+def cut(batch: td.RawBatch, records: int = MAX_RECORDS) -> Iterator[td.RawBatch]:
     """The batch in pieces of at most ``records``."""
     for start in range(0, max(len(batch), 1), records):
         yield batch.part(start, min(start + records, len(batch)))
@@ -269,7 +268,7 @@ class RawDigest:
         self.ends_with = ends_with
         self._phases: dict[str, tuple[hashlib._Hash, hashlib._Hash]] = {}
 
-    def update(self, phase: str, batch: RawBatch) -> None:
+    def update(self, phase: str, batch: td.RawBatch) -> None:
         if not len(batch):
             return
         columns, payloads = self._phases.setdefault(phase, (hashlib.sha256(), hashlib.sha256()))
@@ -310,7 +309,7 @@ class PreviewEncoder:
         self.kind = preview_schema(channels)
         self._fields = dict(zip(channels, preview_fields(channels), strict=True))
 
-    def encode(self, block: SampleBlock, i: int) -> bytes:
+    def encode(self, block: td.SampleBlock, i: int) -> bytes:
         x, y, z = block.readings[i].tolist()
         named = {f: float(block.channels[c][i]) for c, f in self._fields.items() if c in block.channels}
         return bytes(self.kind.message(time_ns=int(block.time_ns[i]), x=x, y=y, z=z, **named).SerializeToString())
@@ -324,7 +323,7 @@ class Decimator:
         self._period_ns = max(1, round(1e9 / rate_hz))
         self._last_slot = -1
 
-    def pick(self, block: SampleBlock) -> list[int]:
+    def pick(self, block: td.SampleBlock) -> list[int]:
         """Indices into ``block`` of the samples to keep."""
         if not len(block):
             return []

@@ -17,9 +17,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from triaxcal_drivers.files import read_whole
-from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import Gap, RawBatch
+import triaxcal_drivers as td
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
@@ -171,7 +169,7 @@ class EvidenceIndex:
 
     def _data(self, name: str) -> bytes:
         self.reads += 1
-        return read_whole(self.folder / name, EVIDENCE_MOST)
+        return td.files.read_whole(self.folder / name, EVIDENCE_MOST)
 
     def _texts(self, names: Iterable[str]) -> list[str]:
         """Raises _Unread."""
@@ -275,7 +273,7 @@ class SegmentedWriter(RecordingWriter):
         size_bytes: int = SEGMENT_BYTES,
         time_s: float = SEGMENT_S,
         retention: Retention | None = None,
-        steady_ns: Callable[[], int] = HOST.now_ns,
+        steady_ns: Callable[[], int] = td.host_clock.HOST.now_ns,
         **options: Any,
     ) -> None:
         self.manifest = manifest_path(path)
@@ -295,7 +293,7 @@ class SegmentedWriter(RecordingWriter):
         raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
 
     @property
-    def resumes(self) -> Gap | None:
+    def resumes(self) -> td.Gap | None:
         return self._resumes
 
     @property
@@ -316,7 +314,7 @@ class SegmentedWriter(RecordingWriter):
             self._segments, self.warning = settled(opened.manifest), opened.warning
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
             damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
-            self._resumes = Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
+            self._resumes = td.Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
             before, gone = self._segments, self._room_made()
             file = self._next(before)
             if opened.warning is not None:
@@ -476,7 +474,7 @@ class SegmentedWriter(RecordingWriter):
         self._segments = self._segments.unconfirmed_from(first)
         self._segments.save()
 
-    def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
+    def _write_raw(self, phase: str, first: int, batch: td.RawBatch) -> None:
         self._recorded = True
         if not self._file.digest.records:  # the age of a segment counts from here: before was silence
             self._begun_ns = self._clock_ns()

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.contents import Contents, TopicMessage
@@ -118,7 +118,7 @@ def digest_of(path: Path) -> str:
     """SHA-256 of the whole file. Raises RecordingError."""
     try:
         digest = hashlib.sha256()
-        with open_file(path) as file:
+        with td.files.open_file(path) as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
         return digest.hexdigest()

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
+import triaxcal_drivers as td
 from triaxcald.abort import AbortNotice, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.files import require_new
@@ -123,12 +123,12 @@ class RecordingWriter:
         return hangs or time.monotonic() - self._dropped_s < BEHIND_S
 
     @property
-    def resumes(self) -> Gap | None:
+    def resumes(self) -> td.Gap | None:
         """The open gap before this writer's first record, if it continues an earlier
         recording."""
         return None
 
-    def raw(self, phase: str, batch: RawBatch) -> bool:
+    def raw(self, phase: str, batch: td.RawBatch) -> bool:
         """Hand over a batch; False if the queue is full and it is dropped."""
         self.check()
         with self._order:
@@ -136,7 +136,7 @@ class RecordingWriter:
             self._offered += len(batch)
             return self._offer(schema.RAW, first, len(batch), partial(self._write_raw, phase, first, batch))
 
-    def preview(self, topic: schema.PreviewTopic, block: SampleBlock) -> bool:
+    def preview(self, topic: schema.PreviewTopic, block: td.SampleBlock) -> bool:
         """Hand over the block's samples at the preview rate; False if the queue is full
         and they are dropped."""
         self.check()
@@ -367,10 +367,10 @@ class RecordingWriter:
             loss = schema.Loss(self._clock_ns(), topic, first, records, "the queue to the disk was full")
             self._write(schema.LOSS, loss)
 
-    def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
+    def _write_raw(self, phase: str, first: int, batch: td.RawBatch) -> None:
         self._file.raw(phase, first, batch)
 
-    def _write_preview(self, topic: str, block: SampleBlock, picked: Sequence[int]) -> None:
+    def _write_preview(self, topic: str, block: td.SampleBlock, picked: Sequence[int]) -> None:
         self._file.preview(topic, block, picked)
 
     def _write(self, topic: str, value: schema.RegisterAccess | schema.Event | schema.Loss) -> None:

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 import triaxcal as tc
-from triaxcal_drivers.roles import LINEAR
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.caveats import assumption
 from triaxcald.certificate import Certified
@@ -124,7 +124,7 @@ def _line(entry: Mapping[str, object]) -> BudgetLine:
 
 def _expanded(known: Mapping[str, object]) -> Iterator[tuple[str, float | None]]:
     """Of every coefficient, by a name like `bias.x` or `warm_up.x`."""
-    for group in LINEAR:
+    for group in td.roles.LINEAR:
         for axis, value in zip("xyz", vector(known.get(group)) or (None, None, None), strict=True):
             yield f"{group}.{axis}", value
     for effect, values in mapping(known.get("effects")).items():

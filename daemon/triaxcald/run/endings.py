@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, SecondAnswer
+import triaxcal_drivers as td
 from triaxcald import errors as exit_codes
 from triaxcald import text
 from triaxcald.certificate import exceeded
@@ -109,14 +109,14 @@ _CODES: tuple[tuple[type[BaseException], Code], ...] = (
     (KeyboardInterrupt, Code.STOPPED),
     (DiskError, Code.DISK),
     (TwoAnswer, Code.TWO_ANSWER),
-    (SecondAnswer, Code.TWO_ANSWER),
+    (td.SecondAnswer, Code.TWO_ANSWER),
     (WrongUnit, Code.WRONG_UNIT),
     (SerialTwice, Code.SERIAL_TWICE),
     (DeviceInUse, Code.IN_USE),
     (Implausible, Code.IMPLAUSIBLE),
     (NoPoses, Code.NO_POSES),
-    (DeviceAbsent, Code.ABSENT),
-    (DeviceSilent, Code.LOST),
-    (BusError, Code.LOST),
+    (td.DeviceAbsent, Code.ABSENT),
+    (td.DeviceSilent, Code.LOST),
+    (td.BusError, Code.LOST),
 )
 """Error classes with their codes, in the order of the search."""

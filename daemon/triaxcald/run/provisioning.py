@@ -12,9 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import triaxcal as tc
-from triaxcal_drivers.errors import RegisterValueError
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import Profile
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.documents import to_text
@@ -117,7 +115,7 @@ class ProvisionRun:
             else None
         )
 
-    async def _work(self, device: Device) -> None:
+    async def _work(self, device: td.Device) -> None:
         bundle = self.place.bundle
         link = RegisterLink(device, bundle.profile, name=self.place.device_name)
         image = self.image or await self._image_of_journal(link)
@@ -228,7 +226,7 @@ class RestoreRun(ProvisionRun):
     snapshot: Snapshot = field(default_factory=lambda: Snapshot({}))
     source: Path | None = None
 
-    async def _work(self, device: Device) -> None:
+    async def _work(self, device: td.Device) -> None:
         profile = self.place.bundle.profile
         self.serial = self.snapshot.serial
         p = self._begin(
@@ -246,7 +244,7 @@ class RestoreRun(ProvisionRun):
         return text.put_back(self.provisioning)
 
 
-def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
+def snapshot_in(path: Path, profile: td.Profile) -> tuple[Snapshot, str | None]:
     """The register snapshot of a recording or a journal, and the name of the unit.
     Raises InputError."""
     held, serial, unit = _kept(path)
@@ -255,7 +253,7 @@ def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
             raise InputError(f"{path}: register {name}: profile {profile.name} has none of that name")
         try:
             profile.decode(name, raw)
-        except RegisterValueError as e:
+        except td.RegisterValueError as e:
             raise InputError(f"{path}: {e}") from e
     return Snapshot(held, serial), unit
 

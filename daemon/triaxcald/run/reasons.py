@@ -6,7 +6,7 @@ import asyncio
 import traceback
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError
+import triaxcal_drivers as td
 from triaxcald.errors import DaemonError
 from triaxcald.memory import out_of_memory, ran_out_of_memory
 
@@ -28,4 +28,4 @@ def trace_of(e: BaseException) -> str | None:
 
 def is_internal(e: BaseException) -> bool:
     """Whether the error is none of the packages' own: a defect of this program."""
-    return not isinstance(e, (tc.TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))
+    return not isinstance(e, (tc.TriaxcalError, td.DriverError, DaemonError, asyncio.CancelledError))

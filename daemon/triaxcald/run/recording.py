@@ -14,9 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.claim import Claim
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import READINGS
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.errors import DEVICE, DONE, RecordingError, exit_code_of
 from triaxcald.provision.identity import IdentityRead, WrongUnit
@@ -200,7 +198,7 @@ class AtRecording(ABC):
         Raises DeviceInUse if another process has it."""
         async with AsyncExitStack() as claimed:
             if manifest is not None:
-                await claimed.enter_async_context(locked(Claim(f"recording {manifest.resolve()}")))
+                await claimed.enter_async_context(locked(td.Claim(f"recording {manifest.resolve()}")))
             await self._written_by(make, record)
 
     async def _written_by(
@@ -446,15 +444,15 @@ class UnitRecording(AtRecording):
 
     @property
     def _counts(self) -> dict[str, int]:
-        return dict(self._recorded.streams[READINGS].counts)
+        return dict(self._recorded.streams[td.READINGS].counts)
 
     @property
     def _seconds(self) -> float:
-        return self._recorded.streams[READINGS].seconds
+        return self._recorded.streams[td.READINGS].seconds
 
     @property
     def _host_seconds(self) -> float | None:
-        return self._recorded.streams[READINGS].host_seconds
+        return self._recorded.streams[td.READINGS].host_seconds
 
     @property
     def _latest(self) -> dict[str, float]:
@@ -475,7 +473,7 @@ class UnitRecording(AtRecording):
     async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         session, found = self._session, list[IdentityRead]()
 
-        async def identify(device: Device) -> None:
+        async def identify(device: td.Device) -> None:
             found[:] = [await session.identify(device)]
 
         async with session.place.opened(policy, partial(self._waits, policy), identify) as device:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.interface import Device
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
@@ -80,7 +80,7 @@ class UnitSession:
 
     def reconnecting(
         self,
-        device: Device,
+        device: td.Device,
         identity: IdentityRead,
         policy: RetryPolicy,
         lost: Callable[[str | None], None] = lambda _: None,
@@ -107,7 +107,7 @@ class UnitSession:
         return reconnecting if confirmation is None else confirmation.of(reconnecting)
 
     def confirmation(
-        self, device: Device, identity: IdentityRead, writer: RecordingWriter | None, recorded: Recorded
+        self, device: td.Device, identity: IdentityRead, writer: RecordingWriter | None, recorded: Recorded
     ) -> Confirmation:
         """Confirmation of a unit that was just identified, before ``recorded`` takes
         its records."""
@@ -115,21 +115,21 @@ class UnitSession:
         asked = partial(self._require_same, device, identity) if told.serial_register or told.expect else None
         return Confirmation(asked, writer, recorded, lambda why: self.progress.stage(self.name, text.unidentified(why)))
 
-    async def _require_same(self, device: Device, identity: IdentityRead) -> None:
+    async def _require_same(self, device: td.Device, identity: IdentityRead) -> None:
         """Raises WrongUnit, TwoAnswer."""
         expected, bundle = identity.serial or self.place.unit.serial, self.place.bundle
         link = RegisterLink(device, self.profile, name=self.place.device_name)
         # One request without the link's retries: the reconnection retries itself.
         await identified(link, bundle, expected, where=self.place.address, device=device)
 
-    async def identify(self, device: Device) -> IdentityRead:
+    async def identify(self, device: td.Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
         link, where = RegisterLink(device, self.profile, name=self.place.device_name), self.place.address
         identity = await identified(link, self.place.bundle, self.place.unit.serial, where=where)
         self.serials.add(identity.serial, self.name, where)
         return identity
 
-    async def registers(self, device: Device) -> Snapshot:
+    async def registers(self, device: td.Device) -> Snapshot:
         """All calibration registers, as they are in use. Raises WrongUnit,
         DriverError."""
         return await take_snapshot(RegisterLink(device, self.profile, name=self.place.device_name), self.place.bundle)

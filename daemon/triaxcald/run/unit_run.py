@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
-from triaxcal_drivers.errors import RegisterRefused
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED, READINGS
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.certificate import Certified, certify, why_not_written
@@ -162,7 +160,7 @@ class UnitRun(UnitSession):
             ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
         return self._outcome(ending)
 
-    async def _ending(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
+    async def _ending(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
             return await self._line(device, identity, writer)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording still gets its outcome
@@ -281,7 +279,7 @@ class UnitRun(UnitSession):
             error=error,
             wanted=ending.wanted,
             lost=self._lost,
-            data_quality=tuple(self._acquisition.pipelines[READINGS].data_quality())
+            data_quality=tuple(self._acquisition.pipelines[td.READINGS].data_quality())
             if self._acquisition and ending.exit_code == REFUSED
             else (),
         )
@@ -294,19 +292,19 @@ class UnitRun(UnitSession):
             self._open_journal = None  # no command can use it
             raise
 
-    async def _require_readings_before(self, device: Device) -> None:
+    async def _require_readings_before(self, device: td.Device) -> None:
         """Check, before any pose is taken, that the registers state their readings.
         Raises Refused, DriverError."""
         written = self.station.file.provisioning.write and why_not_written(self.profile) is None
         if written and leaves_open(self.profile):
-            with suppress(RegisterRefused):  # an unreadable register is not written either
+            with suppress(td.RegisterRefused):  # an unreadable register is not written either
                 require_readings_before(self.profile, await self.registers(device))
 
     @property
     def _rezero_record(self) -> dict[str, dict[str, str]]:
         return {} if self.rezero is None else {RECORD: {"calibration": self.rezero.name}}
 
-    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
+    async def _line(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
         acquisition = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
         self._acquisition = acquisition
@@ -315,9 +313,9 @@ class UnitRun(UnitSession):
         reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
-            await self._collect(reconnecting, writer, acquisition, READINGS, wanted)
+            await self._collect(reconnecting, writer, acquisition, td.READINGS, wanted)
         self.progress.stage(self.name, "fitting")
-        poses = acquisition.pipelines[READINGS].finish()
+        poses = acquisition.pipelines[td.READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
             await self._write(device, writer, certified.image, identity, acquisition)
@@ -327,7 +325,9 @@ class UnitRun(UnitSession):
             self.station.file.limits,
         )
         self.progress.stage(self.name, "writing the report")
-        artifacts = {REPORT: await asyncio.to_thread(self._report, certified, acquisition.pipelines[READINGS], ending)}
+        artifacts = {
+            REPORT: await asyncio.to_thread(self._report, certified, acquisition.pipelines[td.READINGS], ending)
+        }
         if ending.verdict is not Verdict.FAIL:
             artifacts[CERTIFICATE] = to_text(certified.document)
         for name, media_type in ((REPORT, "text/html"), (CERTIFICATE, "application/json")):
@@ -338,7 +338,7 @@ class UnitRun(UnitSession):
 
     async def _write(
         self,
-        device: Device,
+        device: td.Device,
         writer: RecordingWriter,
         image: RegisterImage,
         identity: IdentityRead,
@@ -346,14 +346,14 @@ class UnitRun(UnitSession):
     ) -> None:
         async def collect(check: Collection) -> None:
             self.progress.stage(self.name, "verifying by physics")
-            fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
+            fitted = fitted_attitudes(acquisition.pipelines[td.READINGS], self.place.signs)
             plan = self.station.file.plan
             confirmation = self.confirmation(device, identity, writer, check)
             policy = RetryPolicy(plan.comes_back_s, others=self.others)
             reconnecting = self.reconnecting(device, identity, policy, confirmation=confirmation)
             async with confirmation.phase():
                 await confirmation.ask()
-                await self._collect(reconnecting, writer, check, CORRECTED, plan.check_poses, fitted)
+                await self._collect(reconnecting, writer, check, td.CORRECTED, plan.check_poses, fitted)
 
         self._write_back = WriteBack(
             self.place,
@@ -375,7 +375,7 @@ class UnitRun(UnitSession):
             self.place.bundle,
             self.station.file,
             self.station.text,
-            acquisition.pipelines[READINGS],
+            acquisition.pipelines[td.READINGS],
             poses,
             acquisition.digest,
             unit_name=self.name,
@@ -395,7 +395,7 @@ class UnitRun(UnitSession):
         apart_from: tc.Floats | None = None,
     ) -> None:
         plan, targets = self.station.file.plan, None
-        if self.rezero is not None and stream == READINGS:
+        if self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
         await collection.until_posed(
             device,
@@ -404,7 +404,7 @@ class UnitRun(UnitSession):
             stream=stream,
             wanted=wanted,
             targets=targets,
-            nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
+            nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == td.READINGS else (1, 1, 1),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
         )
@@ -420,7 +420,7 @@ class UnitRun(UnitSession):
             there = self.reconnecting(device, identity, RetryPolicy(most_s=0.0), confirmation=confirmation)
             wanted = self.station.file.plan.check_poses
             async with confirmation.phase():
-                await self._collect(there, None, check, CORRECTED, wanted)
+                await self._collect(there, None, check, td.CORRECTED, wanted)
             return corrected(check, self.station.file.reference)
 
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:

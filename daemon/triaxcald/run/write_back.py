@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED, READINGS
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, DiskError, Implausible, StationError, TwoAnswer
@@ -77,7 +75,7 @@ class WriteBack:
     provisioning: Provisioning | None = field(default=None, init=False)
 
     async def examine(
-        self, device: Device, image: RegisterImage, serial: str | None, acquisition: Collection
+        self, device: td.Device, image: RegisterImage, serial: str | None, acquisition: Collection
     ) -> Provisioning:
         """Identifies the unit and reads its registers; nothing is written.
         Raises Implausible, Refused, ProvisionError, StationError, DiskError."""
@@ -121,7 +119,7 @@ class WriteBack:
         except (DiskError, WrongUnit, TwoAnswer):  # raised unchanged
             await p.undo()
             raise
-        except (DriverError, DaemonError, tc.TriaxcalError) as e:
+        except (td.DriverError, DaemonError, tc.TriaxcalError) as e:
             await p.undo()
             raise StationError(f"verification failed: {e}") from e
         except BaseException:
@@ -137,10 +135,10 @@ class WriteBack:
 
     def _output_warnings(self, acquisition: Collection) -> list[SanityWarning]:
         assert self.provisioning is not None
-        if CORRECTED not in acquisition.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
+        if td.CORRECTED not in acquisition.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
             return []
         profile, found = self.place.bundle.profile, self.provisioning.found
-        readings, outputs = acquisition.pipelines[READINGS].poses(), acquisition.pipelines[CORRECTED].poses()
+        readings, outputs = acquisition.pipelines[td.READINGS].poses(), acquisition.pipelines[td.CORRECTED].poses()
         departures = [
             off_g
             for pairs in _alignments(readings, outputs)
@@ -150,12 +148,12 @@ class WriteBack:
 
     async def _verify(self, acquisition: Collection) -> str:
         """Verify the device's own output in check poses; the verdict."""
-        if CORRECTED not in self.place.bundle.profile.streams:
+        if td.CORRECTED not in self.place.bundle.profile.streams:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
         found, reference = corrected(check, self.station.file.reference), self.station.file.reference
-        fitted = fitted_attitudes(acquisition.pipelines[READINGS], self.place.signs)
+        fitted = fitted_attitudes(acquisition.pipelines[td.READINGS], self.place.signs)
         document = self.verification = verification_document(
             corrected(acquisition, reference),
             found,
@@ -177,7 +175,7 @@ class WriteBack:
 
 def corrected(collection: Collection, reference: float) -> Verification:
     """The device's own output in the poses of a collection."""
-    return verified(collection.pipelines[CORRECTED], reference)
+    return verified(collection.pipelines[td.CORRECTED], reference)
 
 
 def _alignments(readings: Sequence[tc.Pose], outputs: Sequence[tc.Pose]) -> Iterator[list[tuple[tc.Pose, tc.Pose]]]:

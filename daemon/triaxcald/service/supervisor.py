@@ -23,7 +23,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.registry import Collector
 
-from triaxcal_drivers.host_clock import HOST
+import triaxcal_drivers as td
 from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 
@@ -130,7 +130,9 @@ class UnitMetrics(Collector):
             gaps_s.add_metric([u.unit], u.gaps_s)
             queued.add_metric([u.unit], u.queued)
             if u.last_ns is not None:
-                last.add_metric([u.unit], (u.last_ns + HOST.steps_ns()) / 1e9)  # as the host's clock has it
+                last.add_metric(
+                    [u.unit], (u.last_ns + td.host_clock.HOST.steps_ns()) / 1e9
+                )  # as the host's clock has it
             if u.path is not None:
                 with suppress(OSError):  # it was taken away: that is seen elsewhere
                     size.add_metric([u.unit], u.path.stat().st_size)

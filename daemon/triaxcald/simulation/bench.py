@@ -13,11 +13,7 @@ import numpy as np
 from pydantic import Field
 
 import triaxcal as tc
-from triaxcal_drivers.can.model import CanBus
-from triaxcal_drivers.catalogue import driver_named, load_bundle
-from triaxcal_drivers.modbus.model import ModbusBus
-from triaxcal_drivers.profile import Bundle, Strict
-from triaxcal_drivers.toml_text import DEVICE, parse_toml, read_toml, validate
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit
@@ -25,7 +21,7 @@ from triaxcald.simulation.unit import ReferenceUnit
 Triple = tuple[float, float, float]
 
 
-class SensorTruth(Strict):
+class SensorTruth(td.Strict):
     """The sensor's true coefficients; ``noise_g`` is white, of one sample."""
 
     scale_factor: Triple = (-2.410618, -2.403823, -2.371761)
@@ -35,7 +31,7 @@ class SensorTruth(Strict):
     effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
 
 
-class Surroundings(Strict):
+class Surroundings(td.Strict):
     temperature_c: float = 25.0
     ramp_c_per_s: float = 0.0
     swing_c: float = 0.0
@@ -47,7 +43,7 @@ CHECK_POSES, CHECK_TOURS = 14, 3
 still finds enough; and after so many restarts the first ones come again."""
 
 
-class Fixture(Strict):
+class Fixture(td.Strict):
     """The tumble fixture: it goes through the poses of the plan, in its order,
     the first once more, again and again; and after a restart of the unit once
     through others, to check by."""
@@ -58,7 +54,7 @@ class Fixture(Strict):
     attitude_error_deg: Annotated[float, Field(ge=0, le=20)] = 2.0
 
 
-class DeviceFile(Strict):
+class DeviceFile(td.Strict):
     """`triaxcal sim DEVICE.toml`."""
 
     format: Literal["triaxcal.device/1"]
@@ -113,10 +109,12 @@ class SyntheticPhysics:
 def load_device(path: Path) -> DeviceFile:
     """Raises InputError, ProfileError."""
     try:
-        text = read_toml(path, expected=DEVICE, pipe=True)
+        text = td.toml_text.read_toml(path, expected=td.toml_text.DEVICE, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
-    return validate(DeviceFile, parse_toml(text, where=str(path), expected=DEVICE), text, where=str(path))
+    return td.toml_text.validate(
+        DeviceFile, td.toml_text.parse_toml(text, where=str(path), expected=td.toml_text.DEVICE), text, where=str(path)
+    )
 
 
 def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:
@@ -185,7 +183,7 @@ class SimulatedUnit:
     whoever wants to look inside."""
 
     device: DeviceFile
-    bundle: Bundle
+    bundle: td.Bundle
     unit: ReferenceUnit
     time_base: TimeBase
     bus: Any
@@ -196,11 +194,11 @@ class SimulatedUnit:
 
     def serve(self) -> AbstractAsyncContextManager[Any]:
         """On its bus, until the context ends. Raises BusError."""
-        if isinstance(self.bus, CanBus):
+        if isinstance(self.bus, td.can.CanBus):
             from triaxcald.simulation.can_unit import CanUnit  # each with the packages of its bus
 
             return CanUnit(self.unit, self.time_base, self.bus)
-        assert isinstance(self.bus, ModbusBus)
+        assert isinstance(self.bus, td.modbus.ModbusBus)
         from triaxcald.simulation.modbus_unit import ModbusUnit
 
         return ModbusUnit(self.unit, self.time_base, self.bus.where, unit_id=self.bus.unit_id)
@@ -208,11 +206,11 @@ class SimulatedUnit:
 
 def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None) -> SimulatedUnit:
     """Build the unit. Raises InputError, ProfileError."""
-    bundle = load_bundle(Path(device.profile))
-    driver = driver_named(bundle.profile.driver, where=where)
+    bundle = td.load_bundle(Path(device.profile))
+    driver = td.driver_named(bundle.profile.driver, where=where)
     if bundle.profile.name not in ("triax-ref-can", "triax-ref-modbus"):
         raise InputError(f"{where}: profile: only triax-ref-can and triax-ref-modbus are simulated")
-    bus = validate(driver.bus_model, device.bus, b"", where=f"{where}: bus")
+    bus = td.toml_text.validate(driver.bus_model, device.bus, b"", where=f"{where}: bus")
     unit = ReferenceUnit(
         physics_of(device, where=where),
         serial_number=device.serial,

@@ -18,12 +18,7 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.description import object_dictionary
-from triaxcal_drivers.can.line import opened
-from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
-from triaxcal_drivers.can.python_can import open_python_can
-from triaxcal_drivers.catalogue import BUILT_IN, load_bundle
-from triaxcal_drivers.errors import BusError
+import triaxcal_drivers as td
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import INVALID_CORRECTED, FaultKind, ReferenceUnit, RegisterFault, SampleRun, UnitSilent
 
@@ -38,7 +33,7 @@ _SOCKETS = tuple(map(Path, ("/proc/net/udp", "/proc/net/udp6")))
 _MULTICAST_PORT = 43113  # python-can's, where the options name none
 
 
-def reader_is_behind(settings: CanBus, bus: can.BusABC) -> bool:
+def reader_is_behind(settings: td.can.CanBus, bus: can.BusABC) -> bool:
     """Whether somebody on the bus has much left to fetch; our own end counts
     too."""
     if settings.interface == "virtual":
@@ -133,7 +128,7 @@ class CanUnit:
     opened, on leaving where it has failed meanwhile.
     """
 
-    def __init__(self, unit: ReferenceUnit, time_base: TimeBase, bus: CanBus) -> None:
+    def __init__(self, unit: ReferenceUnit, time_base: TimeBase, bus: td.can.CanBus) -> None:
         self._unit = unit
         self._time = time_base
         self._settings = bus
@@ -143,10 +138,10 @@ class CanUnit:
         self._heartbeat_s = 0.0
         self._latest: tuple[bytes, ...] = ()
         self._failure: Exception | None = None
-        profile = load_bundle(Path("triax-ref-can")).profile
-        assert isinstance(profile, CanProfile)
+        profile = td.load_bundle(Path("triax-ref-can")).profile
+        assert isinstance(profile, td.can.CanProfile)
         self._objects = _objects(self._node_id)
-        self._registers = {object_address(r.object): name for name, r in profile.registers.items()}
+        self._registers = {td.can.object_address(r.object): name for name, r in profile.registers.items()}
         self._task: asyncio.Task[None] | None = None
         self._reader_behind = False
         time_base.wait_for_reader(lambda: self._reader_behind)
@@ -157,7 +152,7 @@ class CanUnit:
         return self._state == _OPERATIONAL
 
     async def __aenter__(self) -> Self:
-        self._bus = await opened(lambda: open_python_can(self._settings), can.BusABC.shutdown)
+        self._bus = await td.can.opened(lambda: td.can.open_python_can(self._settings), can.BusABC.shutdown)
         node = self._node_id
         self._bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x000, 0x600 + node)])
         self._requests = _Requests(asyncio.get_running_loop(), self._received)
@@ -175,7 +170,7 @@ class CanUnit:
         finally:
             await asyncio.to_thread(self._close)
         if isinstance(outcome, (can.CanError, OSError)):
-            raise BusError(f"simulated unit, {self._settings}: {outcome}") from outcome
+            raise td.BusError(f"simulated unit, {self._settings}: {outcome}") from outcome
         if isinstance(outcome, Exception):
             raise outcome
 
@@ -292,9 +287,9 @@ class CanUnit:
 
 def _objects(node_id: int) -> dict[tuple[int, int], ODVariable]:
     """Every object of the unit's EDS by index and sub-index."""
-    eds = BUILT_IN / "triax-ref-can.eds"
+    eds = td.BUILT_IN / "triax-ref-can.eds"
     found = {}
-    for entry in object_dictionary(eds.read_bytes(), node_id=node_id, where=eds.name).values():
+    for entry in td.can.object_dictionary(eds.read_bytes(), node_id=node_id, where=eds.name).values():
         members = [entry] if isinstance(entry, ODVariable) else entry.subindices.values()
         found.update({(v.index, v.subindex): v for v in members})
     return found

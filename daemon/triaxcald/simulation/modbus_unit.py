@@ -14,19 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.errors import BusError
-from triaxcal_drivers.modbus.model import ModbusBus
-from triaxcal_drivers.modbus.protocol import (
-    DEVICE_FAILURE,
-    ILLEGAL_ADDRESS,
-    ILLEGAL_VALUE,
-    READ_INPUT,
-    ModbusRefusal,
-    SerialLine,
-    TcpAddress,
-    Unanswered,
-)
-from triaxcal_drivers.modbus.stack import serve_serial, serve_tcp
+import triaxcal_drivers as td
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import CALIBRATION, TABLE, ReferenceUnit, RegisterFault, SampleRun, UnitSilent
 
@@ -66,7 +54,7 @@ async def pty_pair(link: Path | None = None) -> AsyncIterator[tuple[str, str]]:
                     link.unlink()
                 link.symlink_to(paths[1])
             except OSError as e:
-                raise BusError(f"cannot link a serial line to {link}: {e.strerror}") from e
+                raise td.BusError(f"cannot link a serial line to {link}: {e.strerror}") from e
             stack.callback(link.unlink, missing_ok=True)
         yield paths[0], paths[1]
 
@@ -85,11 +73,11 @@ BEHIND_RECORDS = 10 * WINDOW_RECORDS
 PTY = "pty:"
 _FILL_PERIOD_S = 1.0
 _CODES = {
-    "unknown": ILLEGAL_ADDRESS,
-    "read_only": ILLEGAL_ADDRESS,
-    "write_only": ILLEGAL_ADDRESS,
-    "locked": DEVICE_FAILURE,
-    "bad_value": ILLEGAL_VALUE,
+    "unknown": td.modbus.ILLEGAL_ADDRESS,
+    "read_only": td.modbus.ILLEGAL_ADDRESS,
+    "write_only": td.modbus.ILLEGAL_ADDRESS,
+    "locked": td.modbus.DEVICE_FAILURE,
+    "bad_value": td.modbus.ILLEGAL_VALUE,
 }
 
 
@@ -184,14 +172,14 @@ class ModbusMap:
 
     def read(self, function: int, address: int, count: int) -> bytes:
         self.fill()
-        if function == READ_INPUT:
+        if function == td.modbus.READ_INPUT:
             if address not in self._windows or count > WINDOW_WORDS:
-                raise ModbusRefusal(ILLEGAL_ADDRESS)
+                raise td.modbus.ModbusRefusal(td.modbus.ILLEGAL_ADDRESS)
             return self._windows[address].window(count)
         words = []
         for at in range(address, address + count):
             if at not in _WORDS:
-                raise ModbusRefusal(ILLEGAL_ADDRESS)
+                raise td.modbus.ModbusRefusal(td.modbus.ILLEGAL_ADDRESS)
             name, word = _WORDS[at]
             words.append(self._read(name)[2 * word : 2 * word + 2])
         return b"".join(words)
@@ -202,11 +190,11 @@ class ModbusMap:
         names, at, end = [], address, address + len(data) // 2
         while at < end:
             if at not in _WORDS:
-                raise ModbusRefusal(ILLEGAL_ADDRESS)
+                raise td.modbus.ModbusRefusal(td.modbus.ILLEGAL_ADDRESS)
             name, word = _WORDS[at]
             size = TABLE[name].size // 2
             if word or at + size > end:
-                raise ModbusRefusal(ILLEGAL_VALUE)  # a part of a register
+                raise td.modbus.ModbusRefusal(td.modbus.ILLEGAL_VALUE)  # a part of a register
             names.append(name)
             at += size
         self.fill()  # the samples before the write were made with the old registers
@@ -218,17 +206,17 @@ class ModbusMap:
         try:
             return self._unit.read(name, self._time_base.now_s())
         except RegisterFault as e:
-            raise ModbusRefusal(_CODES[e.kind]) from e
+            raise td.modbus.ModbusRefusal(_CODES[e.kind]) from e
         except UnitSilent as e:
-            raise Unanswered from e
+            raise td.modbus.Unanswered from e
 
     def _write(self, name: str, raw: bytes) -> None:
         try:
             self._unit.write(name, raw, self._time_base.now_s())
         except RegisterFault as e:
-            raise ModbusRefusal(_CODES[e.kind]) from e
+            raise td.modbus.ModbusRefusal(_CODES[e.kind]) from e
         except UnitSilent as e:
-            raise Unanswered from e
+            raise td.modbus.Unanswered from e
 
 
 def _records(run: SampleRun, stamp_us: NDArray[np.int64], xyz: NDArray[np.int32]) -> bytes:
@@ -253,7 +241,7 @@ class ModbusUnit:
         self,
         unit: ReferenceUnit,
         time_base: TimeBase,
-        where: TcpAddress | SerialLine = TcpAddress("127.0.0.1", 0),  # noqa: B008 - frozen
+        where: td.modbus.TcpAddress | td.modbus.SerialLine = td.modbus.TcpAddress("127.0.0.1", 0),  # noqa: B008 - frozen
         *,
         unit_id: int = 1,
     ) -> None:
@@ -262,7 +250,7 @@ class ModbusUnit:
         self._where = where
         self._unit_id = unit_id
         self._stack = AsyncExitStack()
-        self.bus: ModbusBus
+        self.bus: td.modbus.ModbusBus
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -277,18 +265,18 @@ class ModbusUnit:
     ) -> None:
         await self._stack.aclose()
 
-    async def _serve(self, stack: AsyncExitStack) -> ModbusBus:
-        if isinstance(self._where, TcpAddress):
-            port = await stack.enter_async_context(serve_tcp({self._unit_id: self._map}, self._where))
-            return ModbusBus(host=self._where.host, port=port, unit_id=self._unit_id)
+    async def _serve(self, stack: AsyncExitStack) -> td.modbus.ModbusBus:
+        if isinstance(self._where, td.modbus.TcpAddress):
+            port = await stack.enter_async_context(td.modbus.serve_tcp({self._unit_id: self._map}, self._where))
+            return td.modbus.ModbusBus(host=self._where.host, port=port, unit_id=self._unit_id)
         line = self._where
         outside = line.port
         if line.port.startswith(PTY):
             outside = line.port.removeprefix(PTY)
             near, _ = await stack.enter_async_context(pty_pair(Path(outside)))
-            line = SerialLine(near, line.baudrate, parity="N")  # a pseudo-terminal takes no parity
-        await stack.enter_async_context(serve_serial({self._unit_id: self._map}, line))
-        return ModbusBus(
+            line = td.modbus.SerialLine(near, line.baudrate, parity="N")  # a pseudo-terminal takes no parity
+        await stack.enter_async_context(td.modbus.serve_serial({self._unit_id: self._map}, line))
+        return td.modbus.ModbusBus(
             serial_port=outside,
             baudrate=line.baudrate,
             parity=line.parity,

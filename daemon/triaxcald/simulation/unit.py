@@ -17,9 +17,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.files import read_whole
-from triaxcal_drivers.registers import TYPES, crc
-from triaxcal_drivers.roles import AXES, BIAS, LINEAR, MISALIGNMENT, SCALE_FACTOR
+import triaxcal_drivers as td
 from triaxcald.abort import at_abort
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable, write_bytes
@@ -71,7 +69,7 @@ class Entry:
 
     @property
     def size(self) -> int:
-        return TYPES[self.type].size
+        return td.registers.TYPES[self.type].size
 
     def encode(self, value: float) -> bytes:
         """Most significant byte first."""
@@ -85,10 +83,10 @@ class Entry:
         return int.from_bytes(raw, "big")
 
 
-_PER_AXIS = (*LINEAR, "second_order", "temperature_bias", "temperature_scale_factor")
+_PER_AXIS = (*td.roles.LINEAR, "second_order", "temperature_bias", "temperature_scale_factor")
 
 CRC = "calibration_crc"
-COVERED = (*(f"{name}_{axis}" for name in _PER_AXIS for axis in AXES),
+COVERED = (*(f"{name}_{axis}" for name in _PER_AXIS for axis in td.roles.AXES),
            "reference_temperature", "calibration_date")  # fmt: skip
 """The calibration registers that the checksum covers, in its order."""
 CALIBRATION = (*COVERED, CRC)
@@ -115,13 +113,13 @@ copy."""
 def checksum(copy: Mapping[str, bytes]) -> bytes:
     """The calibration_crc that belongs to a copy of the calibration registers,
     as raw bytes."""
-    return crc("crc-16/modbus", b"".join(copy[name] for name in COVERED)).to_bytes(2, "big")
+    return td.registers.crc("crc-16/modbus", b"".join(copy[name] for name in COVERED)).to_bytes(2, "big")
 
 
 def factory_calibration() -> dict[str, bytes]:
     """The nominal scale factor and the reference temperature; nothing else,
     dated 1970-01-01."""
-    values = {f"{SCALE_FACTOR}_{axis}": -2.4 for axis in AXES} | {"reference_temperature": 25.0}
+    values = {f"{td.roles.SCALE_FACTOR}_{axis}": -2.4 for axis in td.roles.AXES} | {"reference_temperature": 25.0}
     copy = {name: TABLE[name].encode(values.get(name, 0.0)) for name in COVERED}
     return copy | {CRC: checksum(copy)}
 
@@ -409,12 +407,12 @@ class ReferenceUnit:
             dT = temperature_raw[:, None] / 100 - TABLE["reference_temperature"].decode(
                 self._ram["reference_temperature"]
             )
-            v = counts * (FULL_SCALE_V / FULL_SCALE_COUNTS) / self._axes(SCALE_FACTOR)
-            v -= self._axes(BIAS) + self._axes("temperature_bias") * dT
+            v = counts * (FULL_SCALE_V / FULL_SCALE_COUNTS) / self._axes(td.roles.SCALE_FACTOR)
+            v -= self._axes(td.roles.BIAS) + self._axes("temperature_bias") * dT
             s = v
             for _ in range(4):
                 s = (v - self._axes("second_order") * s**2) / (1 + self._axes("temperature_scale_factor") * dT)
-            ax, ay, az = self._axes(MISALIGNMENT)
+            ax, ay, az = self._axes(td.roles.MISALIGNMENT)
             # R = [[1, az, ay], [0, 1, ax], [0, 0, 1]], solved from below
             z = s[:, 2]
             y = s[:, 1] - ax * z
@@ -425,7 +423,7 @@ class ReferenceUnit:
         return limited
 
     def _axes(self, quantity: str) -> NDArray[np.float64]:
-        return np.array([TABLE[f"{quantity}_{a}"].decode(self._ram[f"{quantity}_{a}"]) for a in AXES])
+        return np.array([TABLE[f"{quantity}_{a}"].decode(self._ram[f"{quantity}_{a}"]) for a in td.roles.AXES])
 
 
 # The EEPROM of a simulated unit as a file, so that it survives the process.
@@ -441,7 +439,7 @@ def read_eeprom(path: Path) -> bytes | None:
     Raises InputError."""
     require_writable(path)
     try:
-        return read_whole(path, EEPROM_MOST)
+        return td.files.read_whole(path, EEPROM_MOST)
     except FileNotFoundError:
         return None
     except OSError as e:

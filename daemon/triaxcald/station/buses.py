@@ -7,24 +7,19 @@ from collections.abc import AsyncIterator, Callable, Collection, Iterable, Mappi
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from triaxcal_drivers.can.model import BusSettings
-from triaxcal_drivers.profile import Strict
-from triaxcal_drivers.toml_text import validate
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
-
-if TYPE_CHECKING:
-    from triaxcal_drivers.can.line import BusListener
 
 BUSES_MOST = 32  # more adapters than a machine has ports for
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"  # of files too
 
 
-class Bus(Strict):
+class Bus(td.Strict):
     name: Annotated[str, Field(pattern=NAME)]
     bus: Annotated[dict[str, Any], Field(description="as that of a unit on CAN, without a node")]
 
@@ -35,7 +30,7 @@ class BusPlace:
     settings as the station file has them."""
 
     name: str
-    settings: BusSettings
+    settings: td.can.BusSettings
     given: Mapping[str, Any]
 
     @property
@@ -43,13 +38,12 @@ class BusPlace:
         """Where the bus is, for messages."""
         return ", ".join(f"{k}={v}" for k, v in self.given.items())
 
-    def listener(self) -> BusListener:
-        from triaxcal_drivers.can.line import BusListener  # python-can, which other stations do without
+    def listener(self) -> td.can.BusListener:
 
-        return BusListener(self.settings)
+        return td.can.BusListener(self.settings)
 
     @asynccontextmanager
-    async def opened(self, policy: RetryPolicy, tell: Callable[[Exception], None]) -> AsyncIterator[BusListener]:
+    async def opened(self, policy: RetryPolicy, tell: Callable[[Exception], None]) -> AsyncIterator[td.can.BusListener]:
         """The bus, listened to until the context ends. Raises DeviceInUse where
         another process has its serial port, BusError once the policy gives up
         (``tell`` is told meanwhile)."""
@@ -63,7 +57,9 @@ class BusPlace:
 
 
 @asynccontextmanager
-async def _open(listener: BusListener, policy: RetryPolicy, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
+async def _open(
+    listener: td.can.BusListener, policy: RetryPolicy, tell: Callable[[Exception], None]
+) -> AsyncIterator[None]:
     try:
         await until_open(listener.open, policy, tell)
         yield
@@ -71,14 +67,16 @@ async def _open(listener: BusListener, policy: RetryPolicy, tell: Callable[[Exce
         await listener.close()
 
 
-def bus_places(buses: Sequence[Bus], units: Collection[BusSettings], text: bytes, *, where: str) -> list[BusPlace]:
+def bus_places(
+    buses: Sequence[Bus], units: Collection[td.can.BusSettings], text: bytes, *, where: str
+) -> list[BusPlace]:
     """``units`` are the buses that the station's units are on: to any other
     bus its adapter is asked to listen only. Opens none. Raises ProfileError,
     InputError with the field."""
     driven = {unit.name for unit in units}
     places = []
     for i, bus in enumerate(buses):
-        given = validate(BusSettings, bus.bus, text, where=f"{where}: buses.{i}.bus")
+        given = td.toml_text.validate(td.can.BusSettings, bus.bus, text, where=f"{where}: buses.{i}.bus")
         places.append(BusPlace(bus.name, given if given.name in driven else given.listening(), bus.bus))
         places[-1].listener()  # so that a package that is not there comes out before any bus is opened
     for (_, a), (i, b) in combinations(enumerate(places), 2):

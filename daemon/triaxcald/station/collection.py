@@ -11,11 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 import triaxcal as tc
-from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
-from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
-from triaxcal_drivers.stall_clock import StallTolerantTimer
-from triaxcal_drivers.two_senders import RECORDS
+import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.errors import NoPoses, RecordingError, TwoAnswer
@@ -62,11 +58,11 @@ class Recorded(RawRecords):
     """
 
     phase: Phase
-    bundle: Bundle
+    bundle: td.Bundle
     where: str
     latest: dict[str, float] = field(default_factory=dict, init=False)
     _restarted_ns: int | None = field(default=None, init=False)
-    _undecoded: list[RawBatch] = field(default_factory=list, init=False)
+    _undecoded: list[td.RawBatch] = field(default_factory=list, init=False)
     _decoded_ns: int | None = field(default=None, init=False)
     _device: Streaming | None = field(default=None, init=False)
     _writer: RecordingWriter | None = field(default=None, init=False)
@@ -76,7 +72,7 @@ class Recorded(RawRecords):
         self.streams: dict[str, DecodedStream] = {s: self._decoded(s) for s in self._names()}
 
     def _names(self) -> list[str]:
-        return [s for s in (READINGS, CORRECTED) if s in self.bundle.profile.streams]
+        return [s for s in (td.READINGS, td.CORRECTED) if s in self.bundle.profile.streams]
 
     def _decoded(self, stream: str) -> DecodedStream:
         return DecodedStream(self.bundle, stream)
@@ -94,7 +90,7 @@ class Recorded(RawRecords):
 
     async def records(
         self, device: Streaming, writer: RecordingWriter | None, seconds: float | None = None
-    ) -> AsyncGenerator[RawBatch]:
+    ) -> AsyncGenerator[td.RawBatch]:
         """Batches from the bus, after their hand-over to the writer.
 
         They are decoded at once or some batches later, but at once if the readings may
@@ -117,7 +113,7 @@ class Recorded(RawRecords):
                 raise
             self._decode()
 
-    def _is_due(self, batch: RawBatch, seconds: float | None) -> bool:
+    def _is_due(self, batch: td.RawBatch, seconds: float | None) -> bool:
         """Whether the collected batches are due for decoding."""
         if self._decoded_ns is None or not len(batch) or batch.gap is not None:
             return True
@@ -127,7 +123,7 @@ class Recorded(RawRecords):
             return True
         if seconds is None:
             return False
-        readings = self.streams[READINGS]
+        readings = self.streams[td.READINGS]
         if not readings.host_seconds:  # the rate of the unit's own time is not known yet
             return True
         rate = readings.seconds / readings.host_seconds
@@ -138,7 +134,7 @@ class Recorded(RawRecords):
         if not self._undecoded or self._device is None:
             return
         device, writer, mixed = self._device, self._writer, None
-        batch, self._undecoded = RawBatch.joined(self._undecoded), []
+        batch, self._undecoded = td.RawBatch.joined(self._undecoded), []
         if len(batch):
             self._decoded_ns = int(batch.time_ns[-1])
         for name, decoded in self.streams.items():
@@ -146,19 +142,19 @@ class Recorded(RawRecords):
             mixed = name if block.two_senders else mixed
             # A restart loses the settings of the opening, and it may be another unit.
             if block.restarts and self._tells_restart(batch):
-                device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
-            if len(block) and name == READINGS:
+                device.complain(td.DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
+            if len(block) and name == td.READINGS:
                 self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
             if writer is not None and len(block):
-                writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
+                writer.preview("/preview/readings" if name == td.READINGS else "/preview/corrected", block)
         if mixed is not None:  # raised last: the file has the whole batch
             raise TwoAnswer(text.two_senders(self.where, mixed))
 
-    def _tells_restart(self, batch: RawBatch) -> bool:
+    def _tells_restart(self, batch: td.RawBatch) -> bool:
         """Whether a restart leads to a reconnection. Two units that send at once look
         like endless restarts; after one reconnection the stream continues long enough
         to detect them."""
-        after_s = max(RESTARTED_S, 2 * RECORDS / self.bundle.profile.sampling.rate_hz)
+        after_s = max(RESTARTED_S, 2 * td.two_senders.RECORDS / self.bundle.profile.sampling.rate_hz)
         now_ns, before_ns = int(batch.time_ns[-1]), self._restarted_ns
         if before_ns is not None and now_ns - before_ns < after_s * 1e9:
             return False
@@ -189,12 +185,12 @@ class Recorded(RawRecords):
     ) -> None:
         """Record ``seconds`` of the readings' own time (None: without end). A device
         that sends no complete reading is reconnected."""
-        readings = self.streams[READINGS]
-        watch = self._watch(READINGS, clock_s)
+        readings = self.streams[td.READINGS]
+        watch = self._watch(td.READINGS, clock_s)
         async with aclosing(self.records(device, writer, seconds)) as records:
             async for batch in records:
                 if _interrupted(batch):
-                    watch = self._watch(READINGS, clock_s)
+                    watch = self._watch(td.READINGS, clock_s)
                 if self._undecoded:
                     continue
                 watch.look(device)
@@ -244,7 +240,7 @@ class Collection(Recorded):
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
         lost_s = self.gaps_s  # the time of an interruption does not count as time without a pose
         counted_s: tuple[float, ...] = ()
-        if stream == READINGS and targets is None:
+        if stream == td.READINGS and targets is None:
             tc.planning.directions(wanted)  # computed once, before samples can get lost
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
@@ -263,8 +259,8 @@ class Collection(Recorded):
                     apart_deg=plan.apart_deg,
                     now_s=now_s,
                     nominal_scale_factor=nominal_scale_factor,
-                    plan=stream == READINGS,
-                    repeat=plan.repeat and stream == READINGS,
+                    plan=stream == td.READINGS,
+                    repeat=plan.repeat and stream == td.READINGS,
                     counted_s=counted_s,
                     apart_from=apart_from,
                     targets=targets,
@@ -287,7 +283,7 @@ class Collection(Recorded):
                     )
 
 
-def _interrupted(batch: RawBatch) -> bool:
+def _interrupted(batch: td.RawBatch) -> bool:
     """Whether an interruption begins; the stream after it gets a new time-out."""
     return batch.gap is not None and batch.gap.to_ns is None
 
@@ -302,16 +298,19 @@ class _Watch:
 
     def __init__(self, decoded: DecodedStream, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
-        self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
+        self._samples, self._timer = -1, td.stall_clock.StallTolerantTimer(0.0, 0.0)
         self._before: Counter[str] = Counter()
 
     def look(self, device: Streaming) -> None:
         """Complain to the device after a time-out without a sample, and begin anew."""
         now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
-            self._samples, self._timer = samples, StallTolerantTimer(now_s, SILENCE_SHARE * self._timeout_s)
+            self._samples, self._timer = (
+                samples,
+                td.stall_clock.StallTolerantTimer(now_s, SILENCE_SHARE * self._timeout_s),
+            )
             self._before = Counter(self._decoded.counts)
         elif self._timer.update(now_s) > self._timeout_s:
-            self._samples, self._timer = -1, StallTolerantTimer(0.0, 0.0)
+            self._samples, self._timer = -1, td.stall_clock.StallTolerantTimer(0.0, 0.0)
             what = text.no_sample(self._timeout_s, self._decoded.counts - self._before)
-            device.complain(DeviceSilent(f"{self._stream}: {what}"))
+            device.complain(td.DeviceSilent(f"{self._stream}: {what}"))

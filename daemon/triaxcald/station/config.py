@@ -16,15 +16,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
 import triaxcal as tc
-from triaxcal_drivers.can.model import BusSettings
-from triaxcal_drivers.catalogue import driver_named, load_bundle
-from triaxcal_drivers.claim import claim_of
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.hints import nearest
-from triaxcal_drivers.interface import Device, LineLoad
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, Profile, Strict
-from triaxcal_drivers.roles import LINEAR_ROLES, OTHER_ROLES
-from triaxcal_drivers.toml_text import STATION, parse_toml, read_toml, validate
+import triaxcal_drivers as td
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
@@ -34,7 +26,7 @@ PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
 
 
-class Plan(Strict):
+class Plan(td.Strict):
     """Poses to record, seconds to hold each, poses to check the device by
     afterwards."""
 
@@ -60,7 +52,7 @@ class Plan(Strict):
     ] = 10.0
 
 
-class Limits(Strict):
+class Limits(td.Strict):
     """What is good enough; nothing is judged where nothing is given."""
 
     rms_g: Annotated[float | None, Field(gt=0)] = None
@@ -68,7 +60,7 @@ class Limits(Strict):
     verification_rms_g: Annotated[float | None, Field(gt=0)] = None
 
 
-class Provisioning(Strict):
+class Provisioning(td.Strict):
     write: Annotated[bool, Field(description="write the result to the device")] = True
     power_cycle: Annotated[
         bool,
@@ -76,7 +68,7 @@ class Provisioning(Strict):
     ] = False
 
 
-class Unit(Strict):
+class Unit(td.Strict):
     name: Annotated[str, Field(pattern=NAME)]
     profile: Annotated[
         str,
@@ -90,7 +82,7 @@ class Unit(Strict):
     bus: dict[str, Any]
 
 
-class StationFile(Strict):
+class StationFile(td.Strict):
     format: Literal["triaxcal.station/1"]
     name: str
     folder: Annotated[
@@ -146,7 +138,7 @@ class StationFile(Strict):
         """As `triaxcal.diagnosis.diagnose` has it."""
         return tc.Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
-    def stated(self, profile: Profile) -> tc.Stated:
+    def stated(self, profile: td.Profile) -> tc.Stated:
         """Uncertainties stated by the station file, and the thermal sensitivity stated
         by the device's ``profile``."""
 
@@ -208,7 +200,7 @@ class Place:
     """A unit with its profile and its bus settings."""
 
     unit: Unit
-    bundle: Bundle
+    bundle: td.Bundle
     bus: BaseModel
 
     @property
@@ -220,19 +212,19 @@ class Place:
     def device_name(self) -> str:
         """The device at its address in the driver's words, such as "node 5 on
         socketcan can0"."""
-        claim = claim_of(self.bus)
+        claim = td.claim_of(self.bus)
         return f"{claim.device} of {claim.host}" if claim.host else claim.device
 
-    def device(self) -> Device:
-        return driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
+    def device(self) -> td.Device:
+        return td.driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
 
     @asynccontextmanager
     async def opened(
         self,
         policy: RetryPolicy | None = None,
         tell: Callable[[Exception], None] = lambda _: None,
-        identify: Callable[[Device], Awaitable[None]] | None = None,
-    ) -> AsyncIterator[Device]:
+        identify: Callable[[td.Device], Awaitable[None]] | None = None,
+    ) -> AsyncIterator[td.Device]:
         """The device, open and claimed until the context ends.
 
         Raises DeviceInUse, BusError, DeviceAbsent and the errors of ``identify``.
@@ -247,12 +239,12 @@ class Place:
             if identify is not None:
                 await identify(device)
 
-        async with claimed(claim_of(self.bus), policy, tell):
+        async with claimed(td.claim_of(self.bus), policy, tell):
             try:
                 await (attempt() if policy is None else until_open(attempt, policy, tell))
                 yield device
             finally:
-                with suppress(DriverError):
+                with suppress(td.DriverError):
                     await device.close()
 
     @property
@@ -293,27 +285,29 @@ class Station:
 
 def parse_station(text: bytes, *, where: str) -> StationFile:
     """Raises ProfileError with file, line and key."""
-    return validate(StationFile, parse_toml(text, where=where, expected=STATION), text, where=where)
+    return td.toml_text.validate(
+        StationFile, td.toml_text.parse_toml(text, where=where, expected=td.toml_text.STATION), text, where=where
+    )
 
 
 def load_station(path: Path) -> Station:
     """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line
     with file, line and key."""
     try:
-        text = read_toml(path, expected=STATION, pipe=True)
+        text = td.toml_text.read_toml(path, expected=td.toml_text.STATION, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
     file = parse_station(text, where=str(path))
-    bundles: dict[str, Bundle] = {}
+    bundles: dict[str, td.Bundle] = {}
     places = []
     for i, unit in enumerate(file.units):
         if unit.profile not in bundles:
             beside = path.parent / unit.profile
-            bundles[unit.profile] = load_bundle(beside if os.path.exists(beside) else Path(unit.profile))
+            bundles[unit.profile] = td.load_bundle(beside if os.path.exists(beside) else Path(unit.profile))
         bundle = bundles[unit.profile]
-        driver = driver_named(bundle.profile.driver, where=str(path))
-        bus = validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
-        if file.limits.verification_rms_g is not None and CORRECTED not in bundle.profile.streams:
+        driver = td.driver_named(bundle.profile.driver, where=str(path))
+        bus = td.toml_text.validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
+        if file.limits.verification_rms_g is not None and td.CORRECTED not in bundle.profile.streams:
             raise InputError(
                 f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
             )
@@ -321,7 +315,7 @@ def load_station(path: Path) -> Station:
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     _check_distinct(places, where=str(path))
-    driven = [place.bus for place in places if isinstance(place.bus, BusSettings)]
+    driven = [place.bus for place in places if isinstance(place.bus, td.can.BusSettings)]
     return Station(path, text, file, tuple(places), tuple(bus_places(file.buses, driven, text, where=str(path))))
 
 
@@ -329,7 +323,7 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
     """No two units are one device. Raises InputError with the key of the
     later one."""
     for (_, a), (i, b) in combinations(enumerate(places), 2):
-        if claim_of(a.bus) == claim_of(b.bus):
+        if td.claim_of(a.bus) == td.claim_of(b.bus):
             raise InputError(
                 f"{where}: units.{i}.bus: unit {b.unit.name} is in the place of unit {a.unit.name} ({a.address})"
             )
@@ -340,18 +334,18 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             )
 
 
-def _check_roles(bundle: Bundle, *, where: str) -> None:
+def _check_roles(bundle: td.Bundle, *, where: str) -> None:
     """Check the roles of a profile; coefficients of effects are roles too, and only the
     daemon knows them. Raises InputError with the nearest role."""
-    known = list(LINEAR_ROLES)
-    if any(r.role not in (None, *known, *OTHER_ROLES) for r in bundle.profile.registers.values()):
+    known = list(td.roles.LINEAR_ROLES)
+    if any(r.role not in (None, *known, *td.roles.OTHER_ROLES) for r in bundle.profile.registers.values()):
         known += [f"{e.name}.{c.name}" for e in tc.effects.CATALOGUE for c in e.coefficients]
-    known += OTHER_ROLES
+    known += td.roles.OTHER_ROLES
     for name, register in bundle.profile.registers.items():
         if register.role is not None and register.role not in known:
             raise InputError(
                 f"{where}: {bundle.profile.name}: registers.{name}.role: "
-                f"unknown role '{register.role}'{nearest(register.role, known)}"
+                f"unknown role '{register.role}'{td.hints.nearest(register.role, known)}"
             )
 
 
@@ -429,11 +423,11 @@ def check_lines(places: Sequence[Place], buses: Sequence[BusPlace] = (), *, wher
     InputError with the arithmetic.
     """
     _check_buses(places, buses, where=where)
-    lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
+    lines: dict[str, list[tuple[int, str, td.LineLoad]]] = {}
     for i, place in enumerate(places):
-        loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
-        of_streams: Mapping[str, LineLoad] = loads(place.bundle, place.bus) if loads else {}
-        for name in (READINGS, CORRECTED):  # which are recorded side by side
+        loads = getattr(td.driver_named(place.bundle.profile.driver), "loads", None)
+        of_streams: Mapping[str, td.LineLoad] = loads(place.bundle, place.bus) if loads else {}
+        for name in (td.READINGS, td.CORRECTED):  # which are recorded side by side
             if name in of_streams:
                 load = of_streams[name]
                 lines.setdefault(load.line, []).append((i, f"{place.unit.name} {name}", load))
@@ -458,8 +452,8 @@ def check_lines(places: Sequence[Place], buses: Sequence[BusPlace] = (), *, wher
 
 def _check_buses(places: Sequence[Place], buses: Sequence[BusPlace], *, where: str) -> None:
     """Raises InputError."""
-    on_buses = [(f"unit {p.unit.name}", p.bus) for p in places if isinstance(p.bus, BusSettings)]
-    first: dict[str, tuple[str, BusSettings]] = {}
+    on_buses = [(f"unit {p.unit.name}", p.bus) for p in places if isinstance(p.bus, td.can.BusSettings)]
+    first: dict[str, tuple[str, td.can.BusSettings]] = {}
     for who, settings in (*on_buses, *((f"bus {b.name}", b.settings) for b in buses)):
         other, theirs = first.setdefault(settings.name, (who, settings))
         if settings.driven != theirs.driven:

@@ -6,20 +6,14 @@ import asyncio
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from triaxcal_drivers.errors import BusError
-from triaxcal_drivers.host_clock import HOST, SteadyClock, slept_ns
-from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
+import triaxcal_drivers as td
 from triaxcald.recording.schema import RawDigest
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.reconnect import RetryPolicy, until_open
-
-if TYPE_CHECKING:
-    from triaxcal_drivers.can.line import BusListener
-
 
 # Raw records on their way to disk, with a count of the lost ones.
 
@@ -38,17 +32,17 @@ class RawRecords:
     gaps: int = field(default=0, kw_only=True)
     gaps_s: float = field(default=0.0, kw_only=True)
     last_ns: int | None = field(default=None, kw_only=True)
-    clock: SteadyClock = field(default=HOST, kw_only=True)
+    clock: td.host_clock.SteadyClock = field(default=td.host_clock.HOST, kw_only=True)
 
     def __post_init__(self) -> None:
         self.digest = RawDigest(self.ends_with)
 
     async def written(
-        self, stream: AsyncGenerator[RawBatch], writer: RecordingWriter | None
-    ) -> AsyncGenerator[RawBatch]:
+        self, stream: AsyncGenerator[td.RawBatch], writer: RecordingWriter | None
+    ) -> AsyncGenerator[td.RawBatch]:
         """Batches of a stream after their hand-over to the writer, without those that
         it drops; closes the stream at the end."""
-        unwritten: Gap | None = None
+        unwritten: td.Gap | None = None
         away = None if writer is None else writer.resumes
         stepped_ns = self.clock.steps_ns()
         async with aclosing(stream):
@@ -78,7 +72,7 @@ class RawRecords:
                     self.last_ns = int(batch.time_ns[-1])
                 yield batch
 
-    def _note(self, writer: RecordingWriter | None, gap: Gap | None) -> None:
+    def _note(self, writer: RecordingWriter | None, gap: td.Gap | None) -> None:
         if gap is None:
             return
         detail: dict[str, Any] = {"from_ns": gap.from_ns, "cause": gap.cause}
@@ -90,11 +84,11 @@ class RawRecords:
             writer.event("interrupted" if gap.to_ns is None else "gap", detail)
 
 
-def _unwritten(before: Gap | None, batch: RawBatch) -> Gap:
+def _unwritten(before: td.Gap | None, batch: td.RawBatch) -> td.Gap:
     """The growing gap of a writer that drops records."""
     lost = len(batch) + (before.lost or 0 if before else 0)
     from_ns = int(batch.time_ns[0]) if before is None else before.from_ns
-    return Gap(from_ns, None, OVERRUN, lost)
+    return td.Gap(from_ns, None, OVERRUN, lost)
 
 
 SETTLED_S = 1.0
@@ -117,18 +111,18 @@ class ReconnectingBus:
 
     def __init__(
         self,
-        listener: BusListener,
+        listener: td.can.BusListener,
         policy: RetryPolicy,
         tell: Callable[[str | None], None],
         *,
-        now_ns: Callable[[], int] = HOST.now_ns,
-        slept_ns: Callable[[], int] = slept_ns,
+        now_ns: Callable[[], int] = td.host_clock.HOST.now_ns,
+        slept_ns: Callable[[], int] = td.host_clock.slept_ns,
     ) -> None:
         self._listener, self._policy, self._tell = listener, policy, tell
         self._now_ns, self._slept_ns = now_ns, slept_ns
         self._opened_ns = 0
 
-    async def stream(self) -> AsyncGenerator[RawBatch, None]:
+    async def stream(self) -> AsyncGenerator[td.RawBatch, None]:
         """The listener's batches. An empty batch with an open gap reports an
         interruption, another one its end; the first record after it carries
         RawFlag.LOST_BEFORE. Raises BusError once the policy gives up."""
@@ -141,7 +135,7 @@ class ReconnectingBus:
                         # small a value.
                         before_ns, asleep_ns = asleep_ns, max(asleep_ns, self._slept_ns())
                         if asleep_ns - before_ns > SLEPT_S * 1e9:
-                            yield RawBatch.of([]).after(Gap(heard_ns, heard_ns + asleep_ns - before_ns, SLEPT))
+                            yield td.RawBatch.of([]).after(td.Gap(heard_ns, heard_ns + asleep_ns - before_ns, SLEPT))
                             lost = True
                         lost = lost or (batch.gap is not None and not len(batch))
                         if lost and len(batch):
@@ -149,13 +143,13 @@ class ReconnectingBus:
                         yield batch
                         heard_ns = int(batch.time_ns[-1]) if len(batch) else self._now_ns()
                 return
-            except BusError as e:
-                gap = Gap(heard_ns, None, str(e))
-            yield RawBatch.of([]).after(gap)
+            except td.BusError as e:
+                gap = td.Gap(heard_ns, None, str(e))
+            yield td.RawBatch.of([]).after(gap)
             self._tell(gap.cause)
             await until_open(self._again, self._policy, lambda trouble: self._tell(str(trouble)))
             heard_ns, asleep_ns, lost = self._opened_ns, self._slept_ns(), True
-            yield RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
+            yield td.RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
             self._tell(None)
 
     async def _again(self) -> None:
@@ -196,8 +190,8 @@ class Listened(RawRecords):
         finally:
             self.seconds = now_s() - begun_s
 
-    def _count(self, batch: RawBatch) -> None:
-        error = (batch.flags & RawFlag.ERROR) != 0
+    def _count(self, batch: td.RawBatch) -> None:
+        error = (batch.flags & td.RawFlag.ERROR) != 0
         errors = int(np.count_nonzero(error))
         self.errors += errors
         self.frames += len(batch) - errors

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.claim import Claim, canonical_host, is_name
+import triaxcal_drivers as td
 from triaxcald.errors import DeviceInUse, DeviceInUseElsewhere, StationError
 
 try:
@@ -91,7 +91,7 @@ _held: dict[str, _Held] = {}
 
 
 @asynccontextmanager
-async def locked(claim: Claim) -> AsyncIterator[None]:
+async def locked(claim: td.Claim) -> AsyncIterator[None]:
     """Hold the claim until the context ends. Units of one process share its serial
     port.
 
@@ -243,14 +243,14 @@ def _for_everybody(name: str) -> bool:
 async def _addresses(host: str | None) -> Sequence[str | None]:
     """The host's addresses, each of which is locked, so that its names and its
     addresses exclude each other."""
-    if host is None or not is_name(host):
+    if host is None or not td.is_name(host):
         return [host]
     try:
         async with asyncio.timeout(_LOOKUP_S):
             found = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):  # TimeoutError is an OSError
         return [host]
-    return sorted({canonical_host(str(address[0])) for *_, address in found})
+    return sorted({td.canonical_host(str(address[0])) for *_, address in found})
 
 
 def _printable(text: object) -> str:

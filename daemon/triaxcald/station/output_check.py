@@ -10,12 +10,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import Device, RawBatch, SampleBlock
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
-from triaxcal_drivers.stall_clock import StallTolerantClock
+import triaxcal_drivers as td
 from triaxcald.errors import TwoAnswer
 from triaxcald.provision.identity import BlankIdentity, WrongUnit
 from triaxcald.provision.registers import SanityWarning, Snapshot, departure_g, departure_warnings
@@ -27,26 +22,26 @@ SAMPLES = 20
 two seconds."""
 
 
-async def live_output_warnings(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[SanityWarning]:
+async def live_output_warnings(device: td.Device, bundle: td.Bundle, snapshot: Snapshot) -> list[SanityWarning]:
     """None where the device has no corrected output, or where it does not come."""
-    if CORRECTED not in bundle.profile.streams:
+    if td.CORRECTED not in bundle.profile.streams:
         return []
-    blocks: dict[str, list[SampleBlock]] = {READINGS: [], CORRECTED: []}
-    with suppress(DriverError, TimeoutError):
+    blocks: dict[str, list[td.SampleBlock]] = {td.READINGS: [], td.CORRECTED: []}
+    with suppress(td.DriverError, TimeoutError):
         await _collect(device, bundle, blocks)
-    readings, outputs = (_joined(blocks[name]) for name in (READINGS, CORRECTED))
+    readings, outputs = (_joined(blocks[name]) for name in (td.READINGS, td.CORRECTED))
     _, mine, theirs = np.intersect1d(readings[0], outputs[0], return_indices=True)
     channels = {name: values[mine] for name, values in readings[2].items()}
     off_g = departure_g(bundle.profile, snapshot, readings[1][mine], outputs[1][theirs], channels)
     return departure_warnings(off_g)
 
 
-async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[SampleBlock]]) -> None:
-    driver, sampling = driver_named(bundle.profile.driver), bundle.profile.sampling
+async def _collect(device: td.Device, bundle: td.Bundle, blocks: dict[str, list[td.SampleBlock]]) -> None:
+    driver, sampling = td.driver_named(bundle.profile.driver), bundle.profile.sampling
     decoders = {name: driver.decoder(bundle, name) for name in blocks}
     # So long even if one of the two never comes.
     limit_s = sampling.silence_timeout_s + 2 * SAMPLES / sampling.rate_hz
-    with closing(StallTolerantClock(asyncio.get_running_loop())) as clock:
+    with closing(td.stall_clock.StallTolerantClock(asyncio.get_running_loop())) as clock:
         async with clock.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
             async for batch in stream:
                 for name, decoder in decoders.items():
@@ -55,7 +50,7 @@ async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[Sample
                     return
 
 
-def _joined(blocks: list[SampleBlock]) -> tuple[Any, Any, dict[str, Any]]:
+def _joined(blocks: list[td.SampleBlock]) -> tuple[Any, Any, dict[str, Any]]:
     """Counters (n,), readings (n,3) and channels of all blocks."""
     if not blocks:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), {}
@@ -108,7 +103,7 @@ class Confirmation:
         writer: RecordingWriter | None,
         recorded: Checkpointed,
         tell: Callable[[str], None] = lambda _: None,
-        now_ns: Callable[[], int] = HOST.now_ns,
+        now_ns: Callable[[], int] = td.host_clock.HOST.now_ns,
     ) -> None:
         self.wrong: WrongUnit | None = None
         self._two: TwoAnswer | None = None
@@ -232,7 +227,7 @@ class Confirmation:
         self._recorded.roll_back(checkpoint)
         self._writer.unconfirmed(first, {"confirmed_ns": confirmed_ns, "error": str(why)})
 
-    def heed(self, batch: RawBatch) -> None:
+    def heed(self, batch: td.RawBatch) -> None:
         """Take note of a batch. Raises WrongUnit once another unit is noticed, and
         other errors of the requests. No request is sent while the unit is lost; one is
         sent at once after a gap in its stream."""
@@ -308,7 +303,7 @@ class Confirmed:
     def complain(self, trouble: Exception) -> None:
         self._device.complain(trouble)
 
-    async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
+    async def stream(self, names: Sequence[str]) -> AsyncGenerator[td.RawBatch, None]:
         stream = cast(Any, self._device.stream(names))
         async with self._confirmation.keeping_on(), aclosing(stream):
             async for batch in stream:

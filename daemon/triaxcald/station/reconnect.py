@@ -14,10 +14,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.claim import Claim
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceRestarted, DeviceSilent, RegisterRefused
-from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import Device, Gap, RawBatch, RawFlag
+import triaxcal_drivers as td
 from triaxcald.errors import DeviceInUseElsewhere
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.lock import locked
@@ -39,7 +36,7 @@ AGAIN_S = 60.0
 help: the next pause is longer. Complaints come within a few silence time-outs."""
 UNHEARD = "nothing was received meanwhile"
 
-ABSENT = (BusError, DeviceAbsent, DeviceSilent, RegisterRefused)
+ABSENT = (td.BusError, td.DeviceAbsent, td.DeviceSilent, td.RegisterRefused)
 """Errors that another attempt to open may resolve; a unit that is starting may
 refuse a register."""
 LOST = (*ABSENT, WrongUnit)
@@ -57,7 +54,7 @@ class Exchanged(WrongUnit):
 class Streaming(Protocol):
     """The source of records of a collection."""
 
-    def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]: ...
+    def stream(self, names: Sequence[str]) -> AsyncIterator[td.RawBatch]: ...
 
     def complain(self, trouble: Exception) -> None: ...
 
@@ -186,7 +183,7 @@ class _Retries:
             except mended as e:
                 trouble = e
 
-    async def pause_of_silent(self, silent: DeviceSilent) -> float:
+    async def pause_of_silent(self, silent: td.DeviceSilent) -> float:
         """Time [s] for which only the other streams are read, before the ``silent``
         one is requested again. Raises ``silent`` once the policy gives up."""
         self.say(silent)
@@ -209,17 +206,17 @@ class _Interruption:
     """An open gap. ``awaited`` is the one silent source while others send; None if
     all are silent."""
 
-    gap: Gap
+    gap: td.Gap
     awaited: int | None = None
 
-    def ended(self, batch: RawBatch, good: NDArray[np.intp]) -> RawBatch | None:
+    def ended(self, batch: td.RawBatch, good: NDArray[np.intp]) -> td.RawBatch | None:
         """The batch with the closed gap before it, if one of its ``good`` records
         ends the interruption; else None."""
         back = good if self.awaited is None else good[batch.source[good] == self.awaited]
         if not len(back):
             return None
         lost = batch.gap.lost if batch.gap is not None else None
-        return batch.after(Gap(self.gap.from_ns, int(batch.time_ns[back[0]]), self.gap.cause, lost))
+        return batch.after(td.Gap(self.gap.from_ns, int(batch.time_ns[back[0]]), self.gap.cause, lost))
 
 
 async def until_open(
@@ -241,7 +238,9 @@ async def until_open(
 
 
 @asynccontextmanager
-async def claimed(claim: Claim, policy: RetryPolicy | None, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
+async def claimed(
+    claim: td.Claim, policy: RetryPolicy | None, tell: Callable[[Exception], None]
+) -> AsyncIterator[None]:
     """Hold the claim until the context ends.
 
     Raises DeviceInUse: at once, or once ``policy`` gives up if it retries that.
@@ -269,11 +268,11 @@ class ReconnectingDevice:
 
     def __init__(
         self,
-        device: Device,
+        device: td.Device,
         identify: Callable[[], Awaitable[None]],
         policy: RetryPolicy,
         tell: Callable[[str | None], None],
-        now_ns: Callable[[], int] = HOST.now_ns,
+        now_ns: Callable[[], int] = td.host_clock.HOST.now_ns,
         *,
         hole_s: float = HOLE_S,
     ) -> None:
@@ -286,7 +285,7 @@ class ReconnectingDevice:
         were lost."""
         self._complaint = trouble
 
-    async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
+    async def stream(self, names: Sequence[str]) -> AsyncGenerator[td.RawBatch, None]:
         """The device's batches, with its interruptions as gaps.
 
         An interruption begins with an empty batch whose gap is open; the first
@@ -325,15 +324,15 @@ class ReconnectingDevice:
                 except LOST as e:
                     trouble: Exception = e
                 if interruption is None:
-                    interruption = _Interruption(Gap(self._since_ns(trouble, last_ns), None, str(trouble)))
-                    anew = self._complaint is None or isinstance(trouble, DeviceRestarted)
+                    interruption = _Interruption(td.Gap(self._since_ns(trouble, last_ns), None, str(trouble)))
+                    anew = self._complaint is None or isinstance(trouble, td.DeviceRestarted)
                     if anew or self._now_ns() - returned_ns > AGAIN_S * 1e9:
                         retries = self._retries()
                     retries.told = ""
                     suspended.enter_context(self._policy.waiting())
                     retries.say(trouble)
-                    yield RawBatch.of([]).after(interruption.gap)
-                if isinstance(trouble, DeviceSilent) and trouble.stream in asked:
+                    yield td.RawBatch.of([]).after(interruption.gap)
+                if isinstance(trouble, td.DeviceSilent) and trouble.stream in asked:
                     interruption.awaited = trouble.source
                     asked = [name for name in asked if name != trouble.stream]
                     if asked:
@@ -346,7 +345,7 @@ class ReconnectingDevice:
                     self._now_ns(),
                 )  # a complaint made meanwhile concerns the old connection
 
-    async def _of_some(self, names: Sequence[str], until_s: float) -> AsyncGenerator[RawBatch, None]:
+    async def _of_some(self, names: Sequence[str], until_s: float) -> AsyncGenerator[td.RawBatch, None]:
         """These streams of the device, up to ``until_s`` of the loop's clock."""
         clock = asyncio.get_running_loop()
         async with aclosing(cast(Any, self._device.stream(names))) as stream:
@@ -362,7 +361,7 @@ class ReconnectingDevice:
         that reports a restart.
         """
         known = interruption is not None and interruption.awaited is not None
-        if known and not isinstance(self._complaint, DeviceRestarted):
+        if known and not isinstance(self._complaint, td.DeviceRestarted):
             self._complaint = None
         elif self._complaint is not None:
             raise self._complaint
@@ -370,7 +369,7 @@ class ReconnectingDevice:
     def _since_ns(self, trouble: Exception, last_ns: int | None) -> int:
         """Start of the silence [ns]: of all streams, or of the one silent stream."""
         since_ns = self._now_ns() if last_ns is None else last_ns
-        if isinstance(trouble, DeviceSilent) and trouble.source is not None:
+        if isinstance(trouble, td.DeviceSilent) and trouble.source is not None:
             return min(since_ns, self._now_ns() - round(trouble.silent_s * 1e9))
         return since_ns
 
@@ -383,20 +382,20 @@ class ReconnectingDevice:
         await self._identify()
 
 
-def _good(batch: RawBatch) -> NDArray[np.intp]:
+def _good(batch: td.RawBatch) -> NDArray[np.intp]:
     """Indices of the valid records."""
-    return np.flatnonzero((batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) == 0)
+    return np.flatnonzero((batch.flags & (td.RawFlag.ERROR | td.RawFlag.INVALID)) == 0)
 
 
-def _parted(batch: RawBatch, good: NDArray[np.intp], last_ns: int | None, hole_s: float) -> Iterator[RawBatch]:
+def _parted(batch: td.RawBatch, good: NDArray[np.intp], last_ns: int | None, hole_s: float) -> Iterator[td.RawBatch]:
     """The batch, split at its holes."""
     if not len(good):
         yield batch
         return
     times = batch.time_ns[good]
     before = np.concatenate([[times[0] if last_ns is None else last_ns], times[:-1]])
-    holes = np.flatnonzero((times - before > hole_s * 1e9) & ((batch.flags[good] & RawFlag.LOST_BEFORE) == 0))
-    gaps = {int(good[i]): Gap(int(before[i]), int(times[i]), UNHEARD) for i in holes}
+    holes = np.flatnonzero((times - before > hole_s * 1e9) & ((batch.flags[good] & td.RawFlag.LOST_BEFORE) == 0))
+    gaps = {int(good[i]): td.Gap(int(before[i]), int(times[i]), UNHEARD) for i in holes}
     for start, stop in pairwise(sorted({0, *gaps, len(batch)})):
         part = batch.part(start, stop)
         yield part.after(gaps[start]) if start in gaps else part

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.recording.export import Rows, require_alike
 from triaxcald.tables.layout import DATED, DAY_TIME, MISSING, MOMENT
@@ -143,7 +143,7 @@ def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
     import pyarrow.parquet as pq
 
     try:
-        with open_file(path) as opened:
+        with td.files.open_file(path) as opened:
             file = pq.ParquetFile(opened)
             if file.metadata.num_rows * file.metadata.num_columns > CELLS_MOST:
                 raise InputError(f"{path}: more than {CELLS_MOST} cells")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from triaxcal_drivers.hints import clipped
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow
 from triaxcald.tables.arrow import MOSTLY, Column
@@ -43,7 +43,7 @@ class Grid:
     ours: bool = True
 
     def called(self, column: int) -> str:
-        return f"column {clipped(self.names[column])}" if self.named else f"column {column + 1}"
+        return f"column {td.hints.clipped(self.names[column])}" if self.named else f"column {column + 1}"
 
     @property
     def is_native(self) -> bool:
@@ -148,7 +148,7 @@ def _require_no_lines_in_cells(columns: Sequence[Column], layout: Layout) -> Non
         for cell in column.over_several_lines():
             swallowed = [line for line in cell.split("\n")[1:] if is_sample(line, layout.separator)]
             if swallowed:
-                quoted = clipped(swallowed[0].strip())
+                quoted = td.hints.clipped(swallowed[0].strip())
                 raise Unclear(f"a stray quotation mark: samples stand between it and the next one ({quoted}…)")
 
 

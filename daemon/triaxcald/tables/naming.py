@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from triaxcal_drivers.hints import clipped
+import triaxcal_drivers as td
 from triaxcald.tables import words as known
 
 OUTPUTS = ("ux", "uy", "uz")
@@ -275,7 +275,7 @@ def _outputs(names: Sequence[Name], triples: Sequence[Triple], *, named: bool) -
             f"no column that is called as an accelerometer's output; if {_called(names, sensors[0])} are meant: "
             f"{_option(names, sensors[0])}"
         )
-    seen = clipped(", ".join(n.text for n in names if n.text))
+    seen = td.hints.clipped(", ".join(n.text for n in names if n.text))
     raise Unclear(f"no three outputs among the columns {seen}; name them: --columns ux=NAME,uy=NAME,uz=NAME")
 
 

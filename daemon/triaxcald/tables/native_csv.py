@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcal_drivers.hints import clipped
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.tables.source import blocks, label_of
 
@@ -227,15 +227,15 @@ class _Parse:
         texts = line.split(",")
         if len(texts) != len(self._fields):
             names = ",".join(self._fields)
-            what = f"{len(texts)} fields, expected {len(self._fields)} ({clipped(names)})"
+            what = f"{len(texts)} fields, expected {len(self._fields)} ({td.hints.clipped(names)})"
             self._fail(number, f"{what}; {_SKIP}")
         row = []
         for field, text in zip(self._fields, map(str.strip, texts), strict=True):
             if not text:
-                self._fail(number, f"field {clipped(field)}: empty, expected a number; {_SKIP}")
+                self._fail(number, f"field {td.hints.clipped(field)}: empty, expected a number; {_SKIP}")
             value = float(text) if len(text) <= _NUMBER_MOST and _NUMBER.fullmatch(text) else float("nan")
             if not abs(value) < _VALUE_LIMIT:
-                self._fail(number, f"field {clipped(field)}: '{text[:40]}', expected a finite number; {_SKIP}")
+                self._fail(number, f"field {td.hints.clipped(field)}: '{text[:40]}', expected a finite number; {_SKIP}")
             row.append(value)
         if abs(row[0]) >= TIME_LIMIT_S:
             self._fail(number, f"field t_s: {texts[0].strip()[:40]}, expected seconds below {TIME_LIMIT_S:g}")

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
-from triaxcal_drivers.files import document_kind
-from triaxcal_drivers.hints import clipped
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import MOSTLY, Column
@@ -86,7 +85,7 @@ def timing_of(
         stated = clock.stated_rate(grid.head)
         if stated is None:
             raise Unclear(_no_time(grid, roles, by_index))
-        rate, where = stated[0], f"'{clipped(stated[1])}'"
+        rate, where = stated[0], f"'{td.hints.clipped(stated[1])}'"
     if rate is not None:
         counters = [*(roles.time[:1] if by_index or TIME in roles.said else ()), *roles.indices]
         index = next(iter(counters), None)
@@ -251,11 +250,15 @@ def rows_where(grid: Grid, where: Mapping[str, str]) -> NDArray[np.bool_]:
         found = [i for i, held in enumerate(grid.names) if name in (held, Name.of(held).text)]
         if len(found) != 1:
             has = ", ".join(Name.of(held).text for held in grid.names) if grid.named else "no header"
-            raise Unclear(f"--where {name}={value}: {len(found)} columns of that name; the table has {clipped(has)}")
+            raise Unclear(
+                f"--where {name}={value}: {len(found)} columns of that name; the table has {td.hints.clipped(has)}"
+            )
         column = grid.columns[found[0]]
         chosen &= column.equals(value)
         if not chosen.any():
-            raise Unclear(f"--where {name}={value}: no row has that; it has {clipped(', '.join(_distinct(column)))}")
+            raise Unclear(
+                f"--where {name}={value}: no row has that; it has {td.hints.clipped(', '.join(_distinct(column)))}"
+            )
     return chosen
 
 
@@ -273,7 +276,8 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
         values = _in_turn(column, chosen, by_number)
         if values:
             raise Unclear(
-                f"rows of several sensors in turn ({grid.called(i)}: {clipped(', '.join(values))}); choose those of "
+                f"rows of several sensors in turn ({grid.called(i)}: {td.hints.clipped(', '.join(values))}); "
+                "choose those of "
                 f"one: --where {Name.of(grid.names[i]).text}={values[0]}"
             )
         if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > MOSTLY:
@@ -282,7 +286,7 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
         if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
             wanted = next((t for t in sorted(texts) if re.search("acc", t, re.IGNORECASE)), min(texts))
             raise Unclear(
-                f"rows of several sensors ({grid.called(i)}: {clipped(', '.join(sorted(texts)))}); choose "
+                f"rows of several sensors ({grid.called(i)}: {td.hints.clipped(', '.join(sorted(texts)))}); choose "
                 f"those of one: --where {Name.of(grid.names[i]).text}={wanted}"
             )
 
@@ -528,7 +532,7 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
             return _table_of(grid_of_parquet(Path(name)), reading, beside)
         data = blocks(name, label)
         first = next(data, b"")
-        if known := document_kind(first):
+        if known := td.files.document_kind(first):
             raise Unclear(f"{known}, expected a recording (.mcap) or a table of samples")
         own = replace(reading, wanted=frozenset()) == Reading() and is_native(first)
         if own and holds_text(whole_lines(first)):
@@ -673,4 +677,4 @@ def _read_as(grid: Grid, roles: Roles, timing: Timing, renamed: Mapping[str, int
 
 def _shown(grid: Grid, column: int) -> str:
     name = Name.of(grid.names[column]).text if grid.named else ""
-    return clipped(name) if name else f"column {column + 1}"
+    return td.hints.clipped(name) if name else f"column {column + 1}"

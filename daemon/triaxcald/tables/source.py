@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from triaxcal_drivers.files import open_file
+import triaxcal_drivers as td
 from triaxcald.errors import InputError
 
 BLOCK = 2**22
@@ -34,7 +34,7 @@ def blocks(source: Path | str | BinaryIO, label: str) -> Iterator[bytes]:
     else:
         packed = str(source).endswith(".gz")
         try:
-            with open_file(Path(source), pipe=not packed) as file:
+            with td.files.open_file(Path(source), pipe=not packed) as file:
                 if packed:
                     with gzip.GzipFile(fileobj=file) as unzipped:
                         yield from _of(unzipped, label, file)

@@ -1,0 +1,23 @@
+"""Public names of a package, each loaded when it is first used: who needs one
+driver does without the libraries of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+
+def lazily(package: str, names: Mapping[str, Sequence[str]], modules: Sequence[str] = ()) -> Callable[[str], Any]:
+    """A ``__getattr__`` for ``package``: ``names`` by the module of the package
+    that defines them, and ``modules`` that are public as a whole."""
+    where = {name: module for module, listed in names.items() for name in listed}
+
+    def find(name: str) -> Any:
+        if name in modules:
+            return import_module(f"{package}.{name}")
+        if name not in where:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(import_module(f"{package}.{where[name]}"), name)
+
+    return find
