@@ -3,6 +3,7 @@ driver does without the libraries of the others."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -18,6 +19,8 @@ def lazily(package: str, names: Mapping[str, Sequence[str]], modules: Sequence[s
             return import_module(f"{package}.{name}")
         if name not in where:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(import_module(f"{package}.{where[name]}"), name)
+        found = getattr(import_module(f"{package}.{where[name]}"), name)
+        setattr(sys.modules[package], name, found)  # not asked for again
+        return found
 
     return find

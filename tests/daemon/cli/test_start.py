@@ -90,7 +90,7 @@ def test_a_command_that_there_is_not_is_answered_with_the_nearest(
     assert said in line
 
 
-@pytest.mark.parametrize("module", ["provisioning", "line", "measuring", "fitting"])
+@pytest.mark.parametrize("module", ["provisioning", "stations", "measuring", "fitting"])
 def test_a_command_begins_without_the_models_of_documents(module: str) -> None:
     code = f"import sys, triaxcald.cli.{module}; print(*(m for m in sys.modules if m.startswith('triaxcald.schema.')))"
     done = _python(code)
