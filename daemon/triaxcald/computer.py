@@ -12,8 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy.linalg  # noqa: F401 - brings the other library
-import scipy.linalg  # noqa: F401 - brings a library of linear algebra of its own
+import numpy.linalg
+import scipy.linalg  # brings a library of linear algebra of its own
 from threadpoolctl import ThreadpoolController
 
 PROCESSOR, BLAS, KERNEL = "processor", "blas", "blas_kernel"
@@ -26,6 +26,8 @@ def compute_with_one_thread() -> None:
     """Linear algebra in this process, for good: whoever computes figures that
     an audit compares calls it first. Costs next to nothing when called again."""
     _libraries().limit(limits=1, user_api="blas")
+    for inverse in (numpy.linalg.inv, scipy.linalg.inv):  # the buffer of each library is taken at its first use
+        inverse(numpy.eye(2))
 
 
 @cache
