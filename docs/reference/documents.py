@@ -5,22 +5,25 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import re
 from collections.abc import Iterator
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import triaxcal as tc
+from triaxcald.documents import to_text
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Verdict
-from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.run import Demo, Run
 from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
-MODELS: dict[str, type[Model]] = {
+LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
+MODELS: dict[str, type[tc.schema.Model]] = {
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -81,7 +84,7 @@ Before the first write the journal is on the disk, with what the device held and
 
 def pages() -> dict[Path, str]:
     """The text of each page by its path."""
-    made = {HERE / f"{name}.schema.json": json_schema(model) for name, model in MODELS.items()}
+    made = {HERE / f"{name}.schema.json": _json_schema(model) for name, model in MODELS.items()}
     certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
     of_a_run = set(_keys(Run).splitlines())
     of_a_demo = [row for row in _keys(Demo).splitlines() if row not in of_a_run]
@@ -114,6 +117,12 @@ def _outcome() -> str:
     )
 
 
+def _json_schema(model: type[tc.schema.Model]) -> str:
+    """The links in descriptions are those of the page, and stay there."""
+    document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
+    return LINK.sub(r"\1", to_text(document))
+
+
 # Tables
 
 
@@ -134,7 +143,7 @@ def _meanings(of: Any) -> Iterator[tuple[Any, str]]:
             yield of[member.targets[0].id], " ".join(str(ast.literal_eval(text.value)).split()).rstrip(".")
 
 
-def _keys(model: type[Model]) -> str:
+def _keys(model: type[tc.schema.Model]) -> str:
     """A row for each key of a document, those of the objects in it below them."""
     schema = model.model_json_schema()
     return _table(("key", "type", "meaning"), list(_rows(schema, schema.get("$defs", {}), "", {})))

@@ -1,0 +1,19 @@
+"""One model for each document of the metrology: it checks what is written, reads
+what was written, and yields the JSON Schema and the page of the reference.
+
+The one room that imports pydantic. Nothing imports it until a document is
+checked or read.
+"""
+
+from triaxcal.schema.figures import Residual, Uncertainty
+from triaxcal.schema.model import Figure, Model, Sha256, Text, Word
+
+__all__ = [
+    "Figure",
+    "Model",
+    "Residual",
+    "Sha256",
+    "Text",
+    "Uncertainty",
+    "Word",
+]
