@@ -23,7 +23,9 @@ from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
 LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
+ANOTHER_PAGE = re.compile(r"\]\(\w+\.md")
 MODELS: dict[str, type[tc.schema.Model]] = {
+    "poses": tc.schema.Poses,
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -38,6 +40,15 @@ JSON_TYPES = {
     "null": "`null`",
     "object": "object",
 }
+PLACES = {"items": "[]", "additionalProperties": ".NAME"}
+"""Of an object inside a list or a table by name, in the key of a row."""
+POSES = """# Poses
+
+`triaxcal poses --json` prints `triaxcal.poses/1`. Rounding, `null` and units are those of [all documents](documents.md).
+
+Made from the model in `triaxcal/schema/poses.py` by `docs/reference/documents.py`; [JSON Schema](poses.schema.json).
+
+"""  # noqa: E501
 CERTIFICATE = """# Certificate
 
 `triaxcal run` and `demo` write `triaxcal.certificate/1` for each unit that did not fail: a file, and an attachment of the recording. It has no time of issue and no signature: an audit computes the same bytes. Rounding, `null` and units are those of [all documents](documents.md).
@@ -85,11 +96,12 @@ Before the first write the journal is on the disk, with what the device held and
 def pages() -> dict[Path, str]:
     """The text of each page by its path."""
     made = {HERE / f"{name}.schema.json": _json_schema(model) for name, model in MODELS.items()}
-    certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
-    of_a_run = set(_keys(Run).splitlines())
-    of_a_demo = [row for row in _keys(Demo).splitlines() if row not in of_a_run]
-    run = RUN + _keys(Run) + DEMO + "\n".join([*_keys(Run).splitlines()[:2], *of_a_demo]) + "\n"
-    texts = {"certificate": certificate, "outcome": _outcome(), "run": run}
+    texts = {
+        "poses": POSES + _keys(tc.schema.Poses),
+        "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
+        "outcome": _outcome(),
+        "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),
+    }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 
 
@@ -143,40 +155,50 @@ def _meanings(of: Any) -> Iterator[tuple[Any, str]]:
             yield of[member.targets[0].id], " ".join(str(ast.literal_eval(text.value)).split()).rstrip(".")
 
 
-def _keys(model: type[tc.schema.Model]) -> str:
-    """A row for each key of a document, those of the objects in it below them."""
+def _keys(model: type[tc.schema.Model], but: type[tc.schema.Model] | None = None) -> str:
+    """A row for each key of a document, those of the objects in it below them;
+    without the rows that another model has in the same words."""
+    known = set(_rows_of(but)) if but else set()
+    return _table(("key", "type", "meaning"), [row for row in _rows_of(model) if row not in known])
+
+
+def _rows_of(model: type[tc.schema.Model]) -> Iterator[tuple[str, str, str]]:
     schema = model.model_json_schema()
-    return _table(("key", "type", "meaning"), list(_rows(schema, schema.get("$defs", {}), "", {})))
+    named = schema.get("$defs", {})
+    yield from _rows(named[model.__name__] if "$ref" in schema else schema, named, "", {})
 
 
 def _rows(
     node: dict[str, Any], named: dict[str, Any], prefix: str, shown: dict[str, str]
 ) -> Iterator[tuple[str, str, str]]:
     """``shown`` are models with the key under which the page has their keys
-    already. A model with a ``format`` is a document with keys of its own."""
+    already. Another page has those of a key whose description links to it. A
+    model with a ``format`` is a document with keys of its own."""
     for name, of in node["properties"].items():
-        key = f"{prefix}{name}"
-        inner, suffix = _model_in(of, named), "[]." if "list" in _type(of, named) else "."
+        key, meaning = f"{prefix}{name}", of["description"]
+        place, inner = _model_in(of, named)
         known = inner and shown.get(inner)
-        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), of["description"].replace("|", r"\|")
-        if inner and not known and "format" not in named[inner]["properties"]:
+        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), meaning.replace("|", r"\|")
+        if inner and not known and "format" not in named[inner]["properties"] and not ANOTHER_PAGE.search(meaning):
             shown[inner] = key
-            yield from _rows(named[inner], named, f"{key}{suffix}", shown)
+            yield from _rows(named[inner], named, f"{key}{place}.", shown)
 
 
-def _model_in(of: dict[str, Any], named: dict[str, Any]) -> str | None:
+def _model_in(of: dict[str, Any], named: dict[str, Any]) -> tuple[str, str | None]:
     """The name of the model of an object, of one that may be null, or of the
-    objects of a list."""
+    objects of a list or by name; before it, its place in these."""
     if isinstance(reference := of.get("$ref"), str):
         name = reference.rpartition("/")[2]
-        return name if "properties" in named[name] else None
-    inner = [*of.get("anyOf", ()), *([of["items"]] if isinstance(of.get("items"), dict) else [])]
-    return next((name for each in inner if (name := _model_in(each, named))), None)
+        return "", name if "properties" in named[name] else None
+    inner = [("", each) for each in (*of.get("anyOf", ()), *of.get("oneOf", ()))]
+    inner += [(place, of[key]) for key, place in PLACES.items() if isinstance(of.get(key), dict)]
+    found = ((place, *_model_in(each, named)) for place, each in inner)
+    return next(((place + below, name) for place, below, name in found if name), ("", None))
 
 
 def _type(of: dict[str, Any], named: dict[str, Any]) -> str:
-    if "anyOf" in of:
-        return " or ".join(_type(each, named) for each in of["anyOf"])
+    if several := of.get("anyOf") or of.get("oneOf"):
+        return " or ".join(dict.fromkeys(_type(each, named) for each in several))
     if isinstance(reference := of.get("$ref"), str):
         return _type(named[reference.rpartition("/")[2]], named)
     if "const" in of:

@@ -7,10 +7,12 @@ checked or read.
 
 from triaxcal.schema.figures import Residual, Uncertainty
 from triaxcal.schema.model import Figure, Model, Sha256, Text, Word
+from triaxcal.schema.poses import Poses
 
 __all__ = [
     "Figure",
     "Model",
+    "Poses",
     "Residual",
     "Sha256",
     "Text",
