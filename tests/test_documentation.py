@@ -490,12 +490,13 @@ NAMED = frozenset(
 EFFECT_LEAVES = {"x", "y", "z"}
 
 
-MODELLED = ("poses", "certificate", "outcome", "run")
+MODELLED = ("poses", "calibration", "certificate", "outcome", "run")
 """Pages that are made from the models of documents."""
 
 
 OF_COMMANDS: dict[str, type[tc.schema.Model]] = {
     "triaxcal.poses/1": tc.schema.Poses,
+    "triaxcal.calibration/1": tc.schema.Calibration,
 }
 
 

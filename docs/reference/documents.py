@@ -26,6 +26,7 @@ LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
 ANOTHER_PAGE = re.compile(r"\]\(\w+\.md")
 MODELS: dict[str, type[tc.schema.Model]] = {
     "poses": tc.schema.Poses,
+    "calibration": tc.schema.Calibration,
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -48,6 +49,30 @@ POSES = """# Poses
 
 Made from the model in `triaxcal/schema/poses.py` by `docs/reference/documents.py`; [JSON Schema](poses.schema.json).
 
+"""  # noqa: E501
+CALIBRATION = """# Calibration
+
+`triaxcal fit` and `rezero` write `triaxcal.calibration/1`, so does `tc.Calibration.save`; a [loop](documents.md#loop) has one under `calibration`. Rounding, `null` and units are those of [all documents](documents.md). A key that only some methods have is absent elsewhere.
+
+Made from the model in `triaxcal/schema/calibration.py` by `docs/reference/documents.py`; [JSON Schema](calibration.schema.json).
+
+"""  # noqa: E501
+METHODS = """
+## Biases anew
+
+`rezero` and `run --rezero`: `poses` are those used, `holds_at` is their mean. The sources of the budget are `kept` (earlier calibration), `since` (changes between recordings), `noise`, `scatter`, `lack_of_fit`.
+
+## A turning unit
+
+`fit --turning`: `poses` is empty, `dilution` is in noises of one sample over the root of their number, `residual` is of stretches. There is no `uncertainty`.
+
+## Known attitudes
+
+`fit --attitudes`: `poses` are those with an attitude, `lack_of_fit_p` is of whole vectors, `dilution` of one axis's four parameters. There is no `uncertainty`.
+
+## Refined datasheet values
+
+`fit --datasheet`: `lack_of_fit_p` is `passport.conflict_p`, `dilution` is of the poses alone. There is no `uncertainty`.
 """  # noqa: E501
 CERTIFICATE = """# Certificate
 
@@ -98,6 +123,7 @@ def pages() -> dict[Path, str]:
     made = {HERE / f"{name}.schema.json": _json_schema(model) for name, model in MODELS.items()}
     texts = {
         "poses": POSES + _keys(tc.schema.Poses),
+        "calibration": CALIBRATION + _keys(tc.schema.Calibration) + METHODS,
         "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
         "outcome": _outcome(),
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),

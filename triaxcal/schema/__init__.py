@@ -5,11 +5,13 @@ The one room that imports pydantic. Nothing imports it until a document is
 checked or read.
 """
 
+from triaxcal.schema.calibration import Calibration
 from triaxcal.schema.figures import Residual, Uncertainty
 from triaxcal.schema.model import Figure, Model, Sha256, Text, Word
 from triaxcal.schema.poses import Poses
 
 __all__ = [
+    "Calibration",
     "Figure",
     "Model",
     "Poses",

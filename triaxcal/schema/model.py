@@ -43,6 +43,10 @@ Word = Annotated[E, Field(strict=False), PlainSerializer(str)]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Figures = list[Figure | None]
 """A number that does not exist is `null`."""
+Vector = Annotated[list[Figure], Field(min_length=3, max_length=3)]
+"""Of x, y, z."""
+Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
+"""Row by row."""
 
 
 class Model(BaseModel):

@@ -113,7 +113,7 @@ class Certificate(tc.schema.Model):
         dict[str, Any],
         Field(
             description="the [`triaxcal.loop/1`](documents.md#loop), "
-            "or after `--rezero` the [`triaxcal.rezero/1`](documents.md#biases-anew)"
+            "or after `--rezero` the [`triaxcal.rezero/1`](calibration.md#biases-anew)"
         ),
     ]
     not_written: Annotated[
