@@ -490,13 +490,14 @@ NAMED = frozenset(
 EFFECT_LEAVES = {"x", "y", "z"}
 
 
-MODELLED = ("poses", "calibration", "certificate", "outcome", "run")
+MODELLED = ("poses", "calibration", "loop", "certificate", "outcome", "run")
 """Pages that are made from the models of documents."""
 
 
 OF_COMMANDS: dict[str, type[tc.schema.Model]] = {
     "triaxcal.poses/1": tc.schema.Poses,
     "triaxcal.calibration/1": tc.schema.Calibration,
+    "triaxcal.loop/1": tc.schema.Loop,
 }
 
 

@@ -135,7 +135,7 @@ def certify(
         ),
         verdict=verdict_of(outside, station.limits),
         outside=outside,
-        result=result,
+        result=(tc.schema.Rezero if loop is None else tc.schema.Loop).model_validate(result),
         not_written=why_not_written(profile),
         registers=_registers_part(image, held, after, poses, stated) if image and held else None,
     ).document()

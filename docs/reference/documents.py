@@ -27,6 +27,8 @@ ANOTHER_PAGE = re.compile(r"\]\(\w+\.md")
 MODELS: dict[str, type[tc.schema.Model]] = {
     "poses": tc.schema.Poses,
     "calibration": tc.schema.Calibration,
+    "loop": tc.schema.Loop,
+    "rezero": tc.schema.Rezero,
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -52,7 +54,7 @@ Made from the model in `triaxcal/schema/poses.py` by `docs/reference/documents.p
 """  # noqa: E501
 CALIBRATION = """# Calibration
 
-`triaxcal fit` and `rezero` write `triaxcal.calibration/1`, so does `tc.Calibration.save`; a [loop](documents.md#loop) has one under `calibration`. Rounding, `null` and units are those of [all documents](documents.md). A key that only some methods have is absent elsewhere.
+`triaxcal fit` and `rezero` write `triaxcal.calibration/1`, so does `tc.Calibration.save`; a [loop](loop.md) has one under `calibration`. Rounding, `null` and units are those of [all documents](documents.md). A key that only some methods have is absent elsewhere.
 
 Made from the model in `triaxcal/schema/calibration.py` by `docs/reference/documents.py`; [JSON Schema](calibration.schema.json).
 
@@ -73,6 +75,23 @@ METHODS = """
 ## Refined datasheet values
 
 `fit --datasheet`: `lack_of_fit_p` is `passport.conflict_p`, `dilution` is of the poses alone. There is no `uncertainty`.
+"""  # noqa: E501
+LOOP = """# Loop
+
+`triaxcal diagnose` writes `triaxcal.loop/1`; a [certificate](certificate.md) has one as its `result`. Rounding, `null` and units are those of [all documents](documents.md). Keys of 0.1 without a meaning today are `null`.
+
+Made from the models in `triaxcal/schema/loop.py` by `docs/reference/documents.py`; JSON Schema of a [loop](loop.schema.json) and a [rezero](rezero.schema.json).
+
+"""  # noqa: E501
+REZERO = """
+## Several recordings
+
+Coefficients ending in `_run2` act in the second recording alone. `run_bias` and `run_scale_factor` are its deviation from the mean of all recordings, or with `_run2_alone` from all the others. `channel_reference.run_index` stands for these. Elsewhere they count as zero, and no register takes them.
+
+## Rezero
+
+After `run --rezero` the `result` of a certificate is a `triaxcal.rezero/1`. It has the keys of a loop that are listed here:
+
 """  # noqa: E501
 CERTIFICATE = """# Certificate
 
@@ -124,6 +143,7 @@ def pages() -> dict[Path, str]:
     texts = {
         "poses": POSES + _keys(tc.schema.Poses),
         "calibration": CALIBRATION + _keys(tc.schema.Calibration) + METHODS,
+        "loop": LOOP + _keys(tc.schema.Loop) + REZERO + _keys(tc.schema.Rezero, but=tc.schema.Loop),
         "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
         "outcome": _outcome(),
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -110,10 +110,11 @@ class Certificate(tc.schema.Model):
     ]
     outside: Annotated[list[str], Field(description="figures that are outside their limits, in words")]
     result: Annotated[
-        dict[str, Any],
+        tc.schema.Loop | tc.schema.Rezero,
         Field(
-            description="the [`triaxcal.loop/1`](documents.md#loop), "
-            "or after `--rezero` the [`triaxcal.rezero/1`](calibration.md#biases-anew)"
+            discriminator="format",
+            description="the [`triaxcal.loop/1`](loop.md), "
+            "or after `--rezero` the [`triaxcal.rezero/1`](loop.md#rezero)",
         ),
     ]
     not_written: Annotated[

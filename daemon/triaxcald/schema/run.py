@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 import triaxcal as tc
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.verification import Verification
-
-OfLoop = list[dict[str, Any]]
 
 
 class UnitOfRun(tc.schema.Model):
@@ -31,9 +29,9 @@ class UnitOfRun(tc.schema.Model):
     after: Annotated[
         tc.schema.Residual | None, Field(description="residual of the final calibration; `null` without a fit")
     ]
-    findings: Annotated[OfLoop, Field(description="as in the [loop](documents.md#loop)")]
-    candidates: Annotated[OfLoop, Field(description="as in the [loop](documents.md#loop)")]
-    choices: Annotated[OfLoop, Field(description="as in the [loop](documents.md#loop)")]
+    findings: Annotated[list[tc.schema.Finding], Field(description="findings of the [loop](loop.md)")]
+    candidates: Annotated[list[tc.schema.Candidate], Field(description="candidates of the [loop](loop.md)")]
+    choices: Annotated[list[tc.schema.Choice], Field(description="choices of the [loop](loop.md)")]
     registers_written: Annotated[list[str], Field(description="registers that were written, in this order")]
     device_state: Annotated[
         tc.schema.Text | None,

@@ -24,6 +24,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "outcome.json": Outcome,
     "certificate.json": Certificate,
     "verification.json": Verification,
+    "certificate.json/result": tc.schema.Loop,
     "certificate.json/result/calibration": tc.schema.Calibration,
 }
 
@@ -122,3 +123,15 @@ def test_the_json_schema_describes_every_key(name: str) -> None:
     assert [key for key in keys["properties"] if key in document] == list(document)
     for properties in (node["properties"] for node in (schema, *schema["$defs"].values()) if "properties" in node):
         assert all(of["description"] for of in properties.values())
+
+
+def test_the_result_of_a_certificate_may_be_a_rezero() -> None:
+    loop, nothing = golden("certificate.json/result"), dict[str, Any](findings=[], candidates=[], choices=[], advice=[])
+    rezero = {key: loop[key] for key in tc.schema.Rezero.model_fields} | {"format": "triaxcal.rezero/1"} | nothing
+    document = golden("certificate.json") | {"result": rezero}
+    read = Certificate.read(document)
+    assert read is not None
+    assert isinstance(read.result, tc.schema.Rezero)
+    assert to_text(read.document()) == to_text(document)
+    assert Certificate.read(document | {"result": rezero | {"candidates": loop["candidates"]}}) is None
+    assert Certificate.read(document | {"result": rezero | {"format": "triaxcal.poses/1"}}) is None

@@ -13,17 +13,22 @@ import numpy as np
 import pytest
 
 import triaxcal as tc
+from triaxcal.diagnosis import Recommendation, Verdict
 from triaxcal.documents import earlier_of, to_text
 from triaxcal.effects import effect_named
 from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Exclusion
+from triaxcal.estimate.hold_out import Contradiction
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.partial_residuals import Quantity
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange.calibration_document import calibration_document, poses_document
 from triaxcal.model.directions import directions
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
-from triaxcal.schema import Calibration, Model, Poses
+from triaxcal.schema import AnotherUnit, Calibration, Finding, HeldOut, Loop, Model, Poses, Rezero, Trace, Unexplained
 from triaxcal.schema.calibration import FittedPose, HoldsAt, NextRecording
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
@@ -121,7 +126,7 @@ def test_a_vector_is_three_numbers(vector: list[object]) -> None:
     assert Calibration.read(document | {"matrix": [vector] * 3}) is None
 
 
-@pytest.mark.parametrize("model", [Poses, Calibration])
+@pytest.mark.parametrize("model", [Poses, Calibration, Loop, Rezero])
 def test_the_json_schema_describes_every_key(model: type[Model]) -> None:
     schema = model.model_json_schema()
     described = [node["properties"] for node in (schema, *schema["$defs"].values()) if "properties" in node]
@@ -144,8 +149,18 @@ def words_of(annotation: Any) -> Iterator[str]:
         (HoldsAt, "moment", Moment),
         (NextRecording, "source", Source),
         (FittedPose, "excluded", Exclusion),
+        (HeldOut, "contradicts", Contradiction),
+        (Finding, "verdict", Verdict),
+        (Unexplained, "kind", UnmodelledKind),
+        (Trace, "quantity", Quantity),
+        (Loop, "call", Recommendation),
+        (Loop, "not_corrected", Refusal),
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_the_words_of_a_key_are_those_that_are_written(model: type[Model], key: str, words: type[StrEnum]) -> None:
     assert set(words_of(model.model_fields[key].annotation)) == {word.value for word in words}
+
+
+def test_a_pose_of_a_change_may_have_no_time() -> None:
+    assert AnotherUnit.read({"start_s": None, "recording": 1, "probability": 0.9}) is not None
