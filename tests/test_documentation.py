@@ -490,8 +490,15 @@ NAMED = frozenset(
 EFFECT_LEAVES = {"x", "y", "z"}
 
 
-MODELLED = ("certificate", "outcome", "run")
+MODELLED = ("poses", "calibration", "loop", "certificate", "outcome", "run")
 """Pages that are made from the models of documents."""
+
+
+OF_COMMANDS: dict[str, type[tc.schema.Model]] = {
+    "triaxcal.poses/1": tc.schema.Poses,
+    "triaxcal.calibration/1": tc.schema.Calibration,
+    "triaxcal.loop/1": tc.schema.Loop,
+}
 
 
 def documented_keys() -> set[str]:
@@ -530,6 +537,10 @@ def test_every_key_of_a_commands_document_is_explained(
     document = json.loads(capsys.readouterr().out)
     assert document["format"] in (PROJECT / "docs/reference/documents.md").read_text("utf-8")
     assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
+    if model := OF_COMMANDS.get(document["format"]):
+        read = model.read(document)
+        assert read is not None
+        assert to_text(read.document()) == to_text(document)
 
 
 def test_every_key_of_the_document_of_a_run_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,5 @@
 """The metrology of three-axis accelerometers: numbers in, numbers out. Needs
-numpy and scipy alone.
+numpy and scipy alone; the models of its documents (`tc.schema`) need pydantic.
 
     import triaxcal as tc
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         pooled_units,
         poses,
         rounding,
+        schema,
         synthetic,
         text,
         uncertainty,
@@ -78,6 +79,7 @@ _ROOMS = (
     "pooled_units",
     "poses",
     "rounding",
+    "schema",
     "synthetic",
     "text",
     "uncertainty",
@@ -171,6 +173,7 @@ __all__ = [
     "poses",
     "rezero",
     "rounding",
+    "schema",
     "synthetic",
     "text",
     "uncertainty",

@@ -135,7 +135,7 @@ def certify(
         ),
         verdict=verdict_of(outside, station.limits),
         outside=outside,
-        result=result,
+        result=(tc.schema.Rezero if loop is None else tc.schema.Loop).model_validate(result),
         not_written=why_not_written(profile),
         registers=_registers_part(image, held, after, poses, stated) if image and held else None,
     ).document()
@@ -220,7 +220,6 @@ def _registers_part(
     image: RegisterImage, held: HeldByDevice, full: tc.estimate.Calibration, poses: list[tc.Pose], stated: tc.Stated
 ) -> RegistersOfCertificate:
     from triaxcald.schema.certificate import RegistersOfCertificate, RegisterWord
-    from triaxcald.schema.figures import Uncertainty
 
     registers = held.registers.calibration
     in_registers = list(registers.terms)
@@ -232,7 +231,7 @@ def _registers_part(
         rms_g=tc.rounding.error(held.beside_process.residual.rms_g),
         cost_rms_g=tc.rounding.error(held.registers.cost),
         rounding_rms_g=tc.rounding.error(rounding_cost(image, registers, poses)),
-        uncertainty=Uncertainty.model_validate(tc.interchange.budget_document(registers, budget)),
+        uncertainty=tc.schema.Uncertainty.model_validate(tc.interchange.budget_document(registers, budget)),
         words=[
             RegisterWord(
                 register=w.register,

@@ -48,72 +48,82 @@ def loop_document(
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
         pose["before_residual_g"] = tc.rounding.error(before.residual_g, reference)
     following = tc.uncertainty.next_recording(loop.after, tc.uncertainty.budget(loop.after, stated))
-    return {
-        "format": "triaxcal.loop/1",
-        "call": loop.call.value,
-        "summary": list(tc.text.diagnosis.lines(loop, small, following, stated)),
-        "before": tc.interchange.residual_document(loop.before.residual, reference),
-        "after": tc.interchange.residual_document(loop.after.residual, reference),
-        **({"held_out": _held_out(loop.held_out, following.expanded_uncertainty, reference)} if loop.held_out else {}),
-        "findings": [_finding(f, loop.refusal, reference_unit) for f in loop.findings],
-        "candidates": [
-            {
-                "effect": c.effect,
-                "probability": calibrated(c.probability),
-                "hangs_on_one_pose": c.hangs_on_one_pose,
-                "coefficients": tc.interchange.coefficients_document(c.coefficients, reference_unit),
-            }
+    given: dict[str, Any] = {}  # keys that most loops do without
+    if loop.held_out:
+        given["held_out"] = _held_out(loop.held_out, following.expanded_uncertainty, reference)
+    if unit_in_doubt or loop.found.change_point:
+        given["doubts"] = [UNIT]
+    return tc.schema.Loop(
+        format="triaxcal.loop/1",
+        call=loop.call.value,
+        summary=list(tc.text.diagnosis.lines(loop, small, following, stated)),
+        before=_residual(loop.before.residual, reference),
+        after=_residual(loop.after.residual, reference),
+        findings=[_finding(f, loop.refusal, reference_unit) for f in loop.findings],
+        candidates=[
+            tc.schema.Candidate(
+                effect=c.effect,
+                probability=calibrated(c.probability),
+                hangs_on_one_pose=c.hangs_on_one_pose,
+                coefficients=tc.interchange.coefficients_document(c.coefficients, reference_unit),
+            )
             for c in loop.candidates
         ],
-        "probabilities": {name: calibrated(p) for name, p in loop.stated.items()},
-        "nothing_probability": tc.rounding.chance(loop.found.nothing),
-        "another_unit": _another(loop),
-        "not_corrected": None if loop.refusal is None else loop.refusal.value,
-        "choices": [
-            {
-                "corrected_by": list(choice.corrected_by),
-                "terms": list(choice.terms),
-                **tc.interchange.residual_document(choice.residual, reference),
-            }
+        probabilities={name: calibrated(p) for name, p in loop.stated.items()},
+        nothing_probability=tc.rounding.chance(loop.found.nothing),
+        another_unit=_another(loop),
+        not_corrected=None if loop.refusal is None else loop.refusal.value,
+        choices=[
+            tc.schema.Choice.model_validate(
+                {
+                    "corrected_by": list(choice.corrected_by),
+                    "terms": list(choice.terms),
+                    **tc.interchange.residual_document(choice.residual, reference),
+                }
+            )
             for choice in correction_options(loop, held_by_device)
         ],
-        "unexplained": _unexplained(loop.found.unexplained, small, reference),
-        **({"doubts": [UNIT]} if unit_in_doubt or loop.found.change_point else {}),
-        "data_quality": list(data_quality),
-        "advice": list(tc.text.diagnosis.advice(loop, small)),
-        "notes": list(tc.text.diagnosis.notes(loop, small)),
-        "traces": [_trace(trace, reference, reference_unit) for trace in loop.traces],
-        "calibration": calibration,
-    }
+        unexplained=_unexplained(loop.found.unexplained, small, reference),
+        data_quality=list(data_quality),
+        advice=list(tc.text.diagnosis.advice(loop, small)),
+        notes=list(tc.text.diagnosis.notes(loop, small)),
+        traces=[_trace(trace, reference, reference_unit) for trace in loop.traces],
+        calibration=tc.schema.Calibration.model_validate(calibration),
+        **given,
+    ).document()
 
 
-def _trace(trace: tc.evidence.Trace, reference: float, reference_unit: str) -> tc.interchange.Document:
+def _residual(residual: tc.estimate.Residual, reference: float) -> tc.schema.Residual:
+    return tc.schema.Residual.model_validate(tc.interchange.residual_document(residual, reference))
+
+
+def _trace(trace: tc.evidence.Trace, reference: float, reference_unit: str) -> tc.schema.Trace:
     in_errors = trace.quantity is tc.evidence.Quantity.STANDARD_ERRORS
     widest = float(trace.half_width.max(initial=0.0))
 
     def value(v: float, known: float) -> float | None:
         return tc.rounding.in_standard_errors(v) if in_errors else tc.rounding.known_to(v, known, reference)
 
-    return {
-        "effect": trace.effect or None,
-        "axis": trace.axis or None,
-        "coefficients": list(trace.coefficients),
-        "variable": trace.variable,
-        "variable_unit": tc.units.in_units_of(tc.evidence.unit_of(trace.variable), reference_unit),
-        "quantity": trace.quantity.value,
-        "share": tc.rounding.uncertainty(trace.share),
-        "p_value": tc.rounding.probability(trace.p_value),
-        "pose": trace.pose.tolist(),
-        "x": tc.rounding.numbers(trace.x),
-        "y": [value(float(y), float(known)) for y, known in zip(trace.y, trace.error, strict=True)],
-        "error": [tc.rounding.uncertainty(float(v)) for v in trace.error],
-        "excluded": trace.excluded.tolist(),
-        "curve": {
-            "x": tc.rounding.numbers(trace.grid),
-            "y": [value(float(y), widest) for y in trace.curve],
-            "half_width": [tc.rounding.known_to(float(v), widest, reference) for v in trace.half_width],
-        },
-    }
+    return tc.schema.Trace(
+        effect=trace.effect or None,
+        axis=trace.axis or None,
+        coefficients=list(trace.coefficients),
+        variable=trace.variable,
+        variable_unit=tc.units.in_units_of(tc.evidence.unit_of(trace.variable), reference_unit),
+        quantity=trace.quantity.value,
+        share=tc.rounding.uncertainty(trace.share),
+        p_value=tc.rounding.probability(trace.p_value),
+        pose=trace.pose.tolist(),
+        x=tc.rounding.numbers(trace.x),
+        y=[value(float(y), float(known)) for y, known in zip(trace.y, trace.error, strict=True)],
+        error=[tc.rounding.uncertainty(float(v)) for v in trace.error],
+        excluded=trace.excluded.tolist(),
+        curve=tc.schema.Curve(
+            x=tc.rounding.numbers(trace.grid),
+            y=[value(float(y), widest) for y in trace.curve],
+            half_width=[tc.rounding.known_to(float(v), widest, reference) for v in trace.half_width],
+        ),
+    )
 
 
 def rezero_document(
@@ -127,20 +137,21 @@ def rezero_document(
     """A calibration with biases anew in the place of a closed loop: it was not
     searched for effects."""
     assert c.update is not None
-    return {
-        "format": "triaxcal.rezero/1",
-        "summary": list(tc.text.bias_update.lines(c, c.update, tc.units.ErrorUnit.of(reference_unit, c.reference))),
-        "before": tc.interchange.residual_document(c.update.before, c.reference),
-        "after": tc.interchange.residual_document(c.residual, c.reference),
-        "findings": [],
-        "candidates": [],
-        "choices": [],
-        "data_quality": list(data_quality),
-        "advice": [],
-        "calibration": tc.interchange.calibration_document(
-            c, output_unit=output_unit, reference_unit=reference_unit, stated=stated
-        ),
-    }
+    calibration = tc.interchange.calibration_document(
+        c, output_unit=output_unit, reference_unit=reference_unit, stated=stated
+    )
+    return tc.schema.Rezero(
+        format="triaxcal.rezero/1",
+        summary=list(tc.text.bias_update.lines(c, c.update, tc.units.ErrorUnit.of(reference_unit, c.reference))),
+        before=_residual(c.update.before, c.reference),
+        after=_residual(c.residual, c.reference),
+        findings=[],
+        candidates=[],
+        choices=[],
+        data_quality=list(data_quality),
+        advice=[],
+        calibration=tc.schema.Calibration.model_validate(calibration),
+    ).document()
 
 
 def calibrated(probability: float | None) -> float | None:
@@ -148,52 +159,51 @@ def calibrated(probability: float | None) -> float | None:
     return None if probability is None else tc.rounding.chance(probability)
 
 
-def _finding(
-    f: tc.diagnosis.Finding, refusal: tc.evidence.Refusal | None, reference_unit: str
-) -> tc.interchange.Document:
-    return {
-        "effect": f.effect,
-        "verdict": f.verdict.value,
-        "probability": calibrated(f.probability),
-        "coefficients": tc.interchange.coefficients_document(f.coefficients, reference_unit),
-        "alternatives": list(f.alternatives),
-        "probabilities": {name: calibrated(p) for name, p in f.alternatives.items()},
-        "reason": tc.text.diagnosis.reason(f, refusal),
-        "remedy": f.remedy,
+def _finding(f: tc.diagnosis.Finding, refusal: tc.evidence.Refusal | None, reference_unit: str) -> tc.schema.Finding:
+    return tc.schema.Finding(
+        effect=f.effect,
+        verdict=f.verdict.value,
+        probability=calibrated(f.probability),
+        coefficients=tc.interchange.coefficients_document(f.coefficients, reference_unit),
+        alternatives=list(f.alternatives),
+        probabilities={name: calibrated(p) for name, p in f.alternatives.items()},
+        reason=tc.text.diagnosis.reason(f, refusal),
+        remedy=f.remedy,
         **dict.fromkeys(NO_LONGER_OF_A_FINDING),
-    }
+    )
 
 
-def _unexplained(part: tc.evidence.Unexplained, small: tc.units.ErrorUnit, reference: float) -> tc.interchange.Document:
-    return {
-        "significant": part.significant,
-        "probability": tc.rounding.chance(part.probability),
-        "kind": None if part.kind is None else part.kind.value,
-        "rms_g": tc.rounding.error(part.rms_g, reference),
-        "lead": tc.text.diagnosis.unexplained(part, small) if part.significant else "",
+def _unexplained(part: tc.evidence.Unexplained, small: tc.units.ErrorUnit, reference: float) -> tc.schema.Unexplained:
+    return tc.schema.Unexplained(
+        significant=part.significant,
+        probability=tc.rounding.chance(part.probability),
+        kind=None if part.kind is None else part.kind.value,
+        rms_g=tc.rounding.error(part.rms_g, reference),
+        lead=tc.text.diagnosis.unexplained(part, small) if part.significant else "",
         **dict.fromkeys(NO_LONGER_OF_WHAT_IS_UNEXPLAINED),
-    }
+    )
 
 
-def _another(loop: tc.diagnosis.Loop) -> tc.interchange.Document | None:
+def _another(loop: tc.diagnosis.Loop) -> tc.schema.AnotherUnit | None:
     """From which pose on there is another unit, or another mounting; None where
     that is unlikely."""
     found = loop.found.change_point
     if found is None:
         return None
     began = loop.after.poses[found.pose].pose.began
-    return {
-        "start_s": tc.rounding.number(began.start_s),
+    return tc.schema.AnotherUnit(
+        start_s=tc.rounding.number(began.start_s),
+        probability=tc.rounding.chance(found.probability),
         **({} if began.recording is None else {"recording": began.recording}),
-        "probability": tc.rounding.chance(found.probability),
-    }
+    )
 
 
-def _held_out(held: tc.estimate.HoldOut, another_day: float, reference: float) -> tc.interchange.Document:
-    return {
-        "before_rms_g": tc.rounding.error(held.before_rms_g, reference),
-        "after_rms_g": tc.rounding.error(held.after_rms_g, reference),
-        "noise_floor_g": tc.rounding.error(held.noise_floor_g, reference),
-        "poses": held.poses,
-        "contradicts": held.contradicts(another_day),
-    }
+def _held_out(held: tc.estimate.HoldOut, another_day: float, reference: float) -> tc.schema.HeldOut:
+    contradiction = held.contradicts(another_day)
+    return tc.schema.HeldOut(
+        before_rms_g=tc.rounding.error(held.before_rms_g, reference),
+        after_rms_g=tc.rounding.error(held.after_rms_g, reference),
+        noise_floor_g=tc.rounding.error(held.noise_floor_g, reference),
+        poses=held.poses,
+        contradicts=None if contradiction is None else contradiction.value,
+    )

@@ -112,15 +112,14 @@ def outcome_document(
 
 def measured_in(certificate: Mapping[str, Any]) -> Measured:
     """The figures of the fit, as the certificate has them."""
-    from triaxcald.schema.figures import Residual
     from triaxcald.schema.outcome import Measured
 
     recording, result = certificate["recording"], certificate["result"]
     return Measured(
         raw_sha256=recording["raw_sha256"],
         poses=recording["poses"],
-        before=Residual.model_validate(result["before"]),
-        after=Residual.model_validate(result["after"]),
+        before=tc.schema.Residual.model_validate(result["before"]),
+        after=tc.schema.Residual.model_validate(result["after"]),
         terms=result["calibration"]["terms"],
         left_to_host=(certificate["registers"] or {}).get("left_to_host", []),
     )

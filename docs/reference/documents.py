@@ -5,22 +5,30 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import re
 from collections.abc import Iterator
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import triaxcal as tc
+from triaxcald.documents import to_text
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Verdict
-from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.run import Demo, Run
 from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
-MODELS: dict[str, type[Model]] = {
+LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
+ANOTHER_PAGE = re.compile(r"\]\(\w+\.md")
+MODELS: dict[str, type[tc.schema.Model]] = {
+    "poses": tc.schema.Poses,
+    "calibration": tc.schema.Calibration,
+    "loop": tc.schema.Loop,
+    "rezero": tc.schema.Rezero,
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -35,6 +43,56 @@ JSON_TYPES = {
     "null": "`null`",
     "object": "object",
 }
+PLACES = {"items": "[]", "additionalProperties": ".NAME"}
+"""Of an object inside a list or a table by name, in the key of a row."""
+POSES = """# Poses
+
+`triaxcal poses --json` prints `triaxcal.poses/1`. Rounding, `null` and units are those of [all documents](documents.md).
+
+Made from the model in `triaxcal/schema/poses.py` by `docs/reference/documents.py`; [JSON Schema](poses.schema.json).
+
+"""  # noqa: E501
+CALIBRATION = """# Calibration
+
+`triaxcal fit` and `rezero` write `triaxcal.calibration/1`, so does `tc.Calibration.save`; a [loop](loop.md) has one under `calibration`. Rounding, `null` and units are those of [all documents](documents.md). A key that only some methods have is absent elsewhere.
+
+Made from the model in `triaxcal/schema/calibration.py` by `docs/reference/documents.py`; [JSON Schema](calibration.schema.json).
+
+"""  # noqa: E501
+METHODS = """
+## Biases anew
+
+`rezero` and `run --rezero`: `poses` are those used, `holds_at` is their mean. The sources of the budget are `kept` (earlier calibration), `since` (changes between recordings), `noise`, `scatter`, `lack_of_fit`.
+
+## A turning unit
+
+`fit --turning`: `poses` is empty, `dilution` is in noises of one sample over the root of their number, `residual` is of stretches. There is no `uncertainty`.
+
+## Known attitudes
+
+`fit --attitudes`: `poses` are those with an attitude, `lack_of_fit_p` is of whole vectors, `dilution` of one axis's four parameters. There is no `uncertainty`.
+
+## Refined datasheet values
+
+`fit --datasheet`: `lack_of_fit_p` is `passport.conflict_p`, `dilution` is of the poses alone. There is no `uncertainty`.
+"""  # noqa: E501
+LOOP = """# Loop
+
+`triaxcal diagnose` writes `triaxcal.loop/1`; a [certificate](certificate.md) has one as its `result`. Rounding, `null` and units are those of [all documents](documents.md). Keys of 0.1 without a meaning today are `null`.
+
+Made from the models in `triaxcal/schema/loop.py` by `docs/reference/documents.py`; JSON Schema of a [loop](loop.schema.json) and a [rezero](rezero.schema.json).
+
+"""  # noqa: E501
+REZERO = """
+## Several recordings
+
+Coefficients ending in `_run2` act in the second recording alone. `run_bias` and `run_scale_factor` are its deviation from the mean of all recordings, or with `_run2_alone` from all the others. `channel_reference.run_index` stands for these. Elsewhere they count as zero, and no register takes them.
+
+## Rezero
+
+After `run --rezero` the `result` of a certificate is a `triaxcal.rezero/1`. It has the keys of a loop that are listed here:
+
+"""  # noqa: E501
 CERTIFICATE = """# Certificate
 
 `triaxcal run` and `demo` write `triaxcal.certificate/1` for each unit that did not fail: a file, and an attachment of the recording. It has no time of issue and no signature: an audit computes the same bytes. Rounding, `null` and units are those of [all documents](documents.md).
@@ -81,12 +139,15 @@ Before the first write the journal is on the disk, with what the device held and
 
 def pages() -> dict[Path, str]:
     """The text of each page by its path."""
-    made = {HERE / f"{name}.schema.json": json_schema(model) for name, model in MODELS.items()}
-    certificate = CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification)
-    of_a_run = set(_keys(Run).splitlines())
-    of_a_demo = [row for row in _keys(Demo).splitlines() if row not in of_a_run]
-    run = RUN + _keys(Run) + DEMO + "\n".join([*_keys(Run).splitlines()[:2], *of_a_demo]) + "\n"
-    texts = {"certificate": certificate, "outcome": _outcome(), "run": run}
+    made = {HERE / f"{name}.schema.json": _json_schema(model) for name, model in MODELS.items()}
+    texts = {
+        "poses": POSES + _keys(tc.schema.Poses),
+        "calibration": CALIBRATION + _keys(tc.schema.Calibration) + METHODS,
+        "loop": LOOP + _keys(tc.schema.Loop) + REZERO + _keys(tc.schema.Rezero, but=tc.schema.Loop),
+        "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
+        "outcome": _outcome(),
+        "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),
+    }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 
 
@@ -114,6 +175,12 @@ def _outcome() -> str:
     )
 
 
+def _json_schema(model: type[tc.schema.Model]) -> str:
+    """The links in descriptions are those of the page, and stay there."""
+    document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
+    return LINK.sub(r"\1", to_text(document))
+
+
 # Tables
 
 
@@ -134,40 +201,50 @@ def _meanings(of: Any) -> Iterator[tuple[Any, str]]:
             yield of[member.targets[0].id], " ".join(str(ast.literal_eval(text.value)).split()).rstrip(".")
 
 
-def _keys(model: type[Model]) -> str:
-    """A row for each key of a document, those of the objects in it below them."""
+def _keys(model: type[tc.schema.Model], but: type[tc.schema.Model] | None = None) -> str:
+    """A row for each key of a document, those of the objects in it below them;
+    without the rows that another model has in the same words."""
+    known = set(_rows_of(but)) if but else set()
+    return _table(("key", "type", "meaning"), [row for row in _rows_of(model) if row not in known])
+
+
+def _rows_of(model: type[tc.schema.Model]) -> Iterator[tuple[str, str, str]]:
     schema = model.model_json_schema()
-    return _table(("key", "type", "meaning"), list(_rows(schema, schema.get("$defs", {}), "", {})))
+    named = schema.get("$defs", {})
+    yield from _rows(named[model.__name__] if "$ref" in schema else schema, named, "", {})
 
 
 def _rows(
     node: dict[str, Any], named: dict[str, Any], prefix: str, shown: dict[str, str]
 ) -> Iterator[tuple[str, str, str]]:
     """``shown`` are models with the key under which the page has their keys
-    already. A model with a ``format`` is a document with keys of its own."""
+    already. Another page has those of a key whose description links to it. A
+    model with a ``format`` is a document with keys of its own."""
     for name, of in node["properties"].items():
-        key = f"{prefix}{name}"
-        inner, suffix = _model_in(of, named), "[]." if "list" in _type(of, named) else "."
+        key, meaning = f"{prefix}{name}", of["description"]
+        place, inner = _model_in(of, named)
         known = inner and shown.get(inner)
-        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), of["description"].replace("|", r"\|")
-        if inner and not known and "format" not in named[inner]["properties"]:
+        yield f"`{key}`", f"as `{known}`" if known else _type(of, named), meaning.replace("|", r"\|")
+        if inner and not known and "format" not in named[inner]["properties"] and not ANOTHER_PAGE.search(meaning):
             shown[inner] = key
-            yield from _rows(named[inner], named, f"{key}{suffix}", shown)
+            yield from _rows(named[inner], named, f"{key}{place}.", shown)
 
 
-def _model_in(of: dict[str, Any], named: dict[str, Any]) -> str | None:
+def _model_in(of: dict[str, Any], named: dict[str, Any]) -> tuple[str, str | None]:
     """The name of the model of an object, of one that may be null, or of the
-    objects of a list."""
+    objects of a list or by name; before it, its place in these."""
     if isinstance(reference := of.get("$ref"), str):
         name = reference.rpartition("/")[2]
-        return name if "properties" in named[name] else None
-    inner = [*of.get("anyOf", ()), *([of["items"]] if isinstance(of.get("items"), dict) else [])]
-    return next((name for each in inner if (name := _model_in(each, named))), None)
+        return "", name if "properties" in named[name] else None
+    inner = [("", each) for each in (*of.get("anyOf", ()), *of.get("oneOf", ()))]
+    inner += [(place, of[key]) for key, place in PLACES.items() if isinstance(of.get(key), dict)]
+    found = ((place, *_model_in(each, named)) for place, each in inner)
+    return next(((place + below, name) for place, below, name in found if name), ("", None))
 
 
 def _type(of: dict[str, Any], named: dict[str, Any]) -> str:
-    if "anyOf" in of:
-        return " or ".join(_type(each, named) for each in of["anyOf"])
+    if several := of.get("anyOf") or of.get("oneOf"):
+        return " or ".join(dict.fromkeys(_type(each, named) for each in several))
     if isinstance(reference := of.get("$ref"), str):
         return _type(named[reference.rpartition("/")[2]], named)
     if "const" in of:

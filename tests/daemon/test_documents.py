@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import triaxcal as tc
 from triaxcal.diagnosis import diagnose
+from triaxcal.documents import earlier_of
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.time import BiasStep, WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange.calibration_document import calibration_document, poses_document
 from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, sensor_of
 from triaxcal.model.directions import directions
@@ -24,7 +27,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number, numbers, probability, uncertainty
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
-from triaxcald.documents import loop_document, to_text
+from triaxcald.documents import loop_document, rezero_document, to_text
 
 SECOND = effect_named("second_order_nonlinearity")
 TRUTH = Sensor(
@@ -218,6 +221,15 @@ def test_the_calibration_is_found_in_a_loop_and_in_a_certificate(poses: list[Pos
     inner = loop["calibration"]
     for document in (inner, loop, {"format": "triaxcal.certificate/1", "result": loop}):
         assert calibration_part(document, where="x") == inner
+
+
+def test_a_rezero_comes_back_byte_for_byte(poses: list[Pose]) -> None:
+    earlier = earlier_of(tc.calibrate(poses, signs=SIGNS), "cal.json", recording="first.csv")
+    document = rezero_document(updated_biases(poses, earlier, first=6), data_quality=["missing_samples: 1 of 2"])
+    assert document["calibration"]["origin"]["calibration"]["name"] == "cal.json"
+    read = tc.schema.Rezero.read(json.loads(to_text(document)))
+    assert read is not None
+    assert to_text(read.document()) == to_text(document)
 
 
 def _without(*keys: str) -> Callable[[dict[str, Any]], None]:

@@ -66,7 +66,6 @@ def worst(outcomes: Sequence[Outcome]) -> int:
 
 
 def _unit(o: Outcome) -> UnitOfRun:
-    from triaxcald.schema.figures import Residual
     from triaxcald.schema.outcome import Outcome as OutcomeDocument
     from triaxcald.schema.run import UnitOfRun
     from triaxcald.schema.verification import Verification
@@ -82,8 +81,8 @@ def _unit(o: Outcome) -> UnitOfRun:
         recording=_text(o.recording),
         certificate=_text(o.certificate),
         report=_text(o.report),
-        before=Residual.model_validate(result["before"]) if result else None,
-        after=Residual.model_validate(result["after"]) if result else None,
+        before=tc.schema.Residual.model_validate(result["before"]) if result else None,
+        after=tc.schema.Residual.model_validate(result["after"]) if result else None,
         findings=result.get("findings", []),
         candidates=result.get("candidates", []),
         choices=result.get("choices", []),

@@ -20,7 +20,6 @@ from triaxcald.caveats import is_passing
 from triaxcald.report.figures import clean, micro_g, number
 from triaxcald.report.meanings import QUALITY
 from triaxcald.schema.certificate import RegisterWord
-from triaxcald.schema.figures import Residual
 
 # Values of a document, read without trust: what is missing or of the wrong kind
 # counts as missing.
@@ -65,7 +64,7 @@ class Stage:
     """A model: its errors and, where known, the residual of every pose in g."""
 
     label: str
-    residual: Residual
+    residual: tc.schema.Residual
     held_out_rms_g: float | None = None
     pose_residual_g: NDArray[np.float64] | None = None
 
@@ -80,13 +79,13 @@ class HoldOut:
     """Whether these poses contradict the calibration."""
 
 
-def residual_of(value: object) -> Residual | None:
+def residual_of(value: object) -> tc.schema.Residual | None:
     return residual_in(known) if (known := mapping(value)) else None
 
 
-def residual_in(known: Mapping[str, object]) -> Residual:
+def residual_in(known: Mapping[str, object]) -> tc.schema.Residual:
     """A figure that is missing or no number is None."""
-    return Residual(**{name: number(known.get(name)) for name in Residual.model_fields})
+    return tc.schema.Residual(**{name: number(known.get(name)) for name in tc.schema.Residual.model_fields})
 
 
 NO_RESIDUAL = residual_in({})
@@ -295,7 +294,7 @@ class Outcome:
     channel_reference: Mapping[str, float | None]
 
     @property
-    def final(self) -> Residual:
+    def final(self) -> tc.schema.Residual:
         return self.stages[-1].residual if self.stages else NO_RESIDUAL
 
     @property

@@ -23,7 +23,6 @@ from triaxcald.report.document import (
 )
 from triaxcald.report.figures import chance, micro_g, p_value, ratio
 from triaxcald.report.meanings import told
-from triaxcald.schema.figures import Residual
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
@@ -341,7 +340,7 @@ def before_after(outcome: Outcome, unit: tc.units.ErrorUnit) -> tuple[Row, ...]:
         return ()
     one = outcome.stages[0].residual if len(outcome.stages) > 1 else None
 
-    def row(name: str, text: Callable[[Residual], str], first: bool = False) -> Row:
+    def row(name: str, text: Callable[[tc.schema.Residual], str], first: bool = False) -> Row:
         return Row(name, "" if one is None else text(one), text(outcome.final), first)
 
     rows = []
@@ -369,7 +368,7 @@ class Choice:
     """``who`` says in words who corrects what."""
 
     who: str
-    residual: Residual
+    residual: tc.schema.Residual
 
 
 def choices_in(document: Mapping[str, object], papers: Mapping[str, object], outcome: Outcome) -> tuple[Choice, ...]:
@@ -401,7 +400,7 @@ def who_corrects(finding: Finding, device: Device | None) -> str:
     return "the device, by its registers" if finding.effect in device.held else "the host: the device has no registers"
 
 
-_Told = tuple[Sequence[str], Sequence[str], Residual]
+_Told = tuple[Sequence[str], Sequence[str], tc.schema.Residual]
 
 
 def _read(entry: Mapping[str, object]) -> _Told:

@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from triaxcald.schema.figures import Uncertainty
-from triaxcald.schema.model import Figure, Model, Sha256
+import triaxcal as tc
 
 Sign = Literal[-1, 1]
 
 
-class UnitOfCertificate(Model):
+class UnitOfCertificate(tc.schema.Model):
     name: Annotated[str, Field(description="name in the station file")]
     vendor: Annotated[str, Field(description="vendor, by the profile")]
     product: Annotated[str, Field(description="product, by the profile")]
     serial: Annotated[str | None, Field(description="serial number; `null` without one")]
 
 
-class NamedFile(Model):
+class NamedFile(tc.schema.Model):
     name: Annotated[str, Field(description="its name")]
-    sha256: Annotated[Sha256, Field(description="digest of its bytes; of a profile, with the files that it names")]
+    sha256: Annotated[
+        tc.schema.Sha256, Field(description="digest of its bytes; of a profile, with the files that it names")
+    ]
 
 
-class RecordingOfCertificate(Model):
+class RecordingOfCertificate(tc.schema.Model):
     raw_sha256: Annotated[
-        Sha256,
+        tc.schema.Sha256,
         Field(description="[digest](recording.md#metadata-and-attachments) of the raw records of the calibration"),
     ]
     started: Annotated[str, Field(description="host's time of the first record, UTC, ISO 8601")]
-    seconds: Annotated[Figure, Field(description="duration [s]")]
+    seconds: Annotated[tc.schema.Figure, Field(description="duration [s]")]
     poses: Annotated[int, Field(description="number of still poses")]
     samples: Annotated[int, Field(description="number of samples that came")]
     missing: Annotated[int, Field(description="number of samples that did not come")]
@@ -44,49 +45,51 @@ class RecordingOfCertificate(Model):
     not_finite: Annotated[int, Field(description="number of samples whose outputs are no finite numbers, if any")] = 0
 
 
-class Settings(Model):
+class Settings(tc.schema.Model):
     signs: Annotated[list[Sign], Field(description="signs of the scale factors of x, y, z")]
-    reference: Annotated[Figure, Field(description="magnitude of the reference vector [g]")]
+    reference: Annotated[tc.schema.Figure, Field(description="magnitude of the reference vector [g]")]
 
 
-class LimitsOfFit(Model):
-    rms_g: Annotated[Figure | None, Field(description="limit of the residual, rms [g]; absent without one")] = None
+class LimitsOfFit(tc.schema.Model):
+    rms_g: Annotated[
+        tc.schema.Figure | None, Field(description="limit of the residual, rms [g]; absent without one")
+    ] = None
     cross_validated_rms_g: Annotated[
-        Figure | None, Field(description="limit of the cross-validated rms [g]; absent without one")
+        tc.schema.Figure | None, Field(description="limit of the cross-validated rms [g]; absent without one")
     ] = None
 
 
-class RegisterWord(Model):
+class RegisterWord(tc.schema.Model):
     register_: str = Field(alias="register", description="name of the register in the profile")
     role: Annotated[str, Field(description="what it is to a calibration: `scale_factor.x`, `bias.y`, …")]
     raw: Annotated[str, Field(description="its bytes, hexadecimal")]
-    wanted: Annotated[Figure | None, Field(description="value as computed [`unit`]")]
-    held: Annotated[Figure | None, Field(description="value as the register holds it [`unit`]")]
+    wanted: Annotated[tc.schema.Figure | None, Field(description="value as computed [`unit`]")]
+    held: Annotated[tc.schema.Figure | None, Field(description="value as the register holds it [`unit`]")]
     unit: Annotated[str, Field(description="unit of the values")]
 
 
-class RegistersOfCertificate(Model):
+class RegistersOfCertificate(tc.schema.Model):
     terms: Annotated[list[str], Field(description="`linear`, and the effects that the registers correct")]
     left_to_host: Annotated[list[str], Field(description="effects that the device has no registers for")]
     holds: Annotated[
         list[str], Field(description="conditions under which the linear part is all of a reading, in words")
     ]
-    rms_g: Annotated[Figure | None, Field(description="rms residual under the registers, in the poses [g]")]
+    rms_g: Annotated[tc.schema.Figure | None, Field(description="rms residual under the registers, in the poses [g]")]
     cost_rms_g: Annotated[
-        Figure | None,
+        tc.schema.Figure | None,
         Field(description="rms difference of |a| from the whole correction, over the sphere [g]"),
     ]
     rounding_rms_g: Annotated[
-        Figure | None, Field(description="rms change of |a| in the poses by rounding to the registers [g]")
+        tc.schema.Figure | None, Field(description="rms change of |a| in the poses by rounding to the registers [g]")
     ]
     uncertainty: Annotated[
-        Uncertainty,
+        tc.schema.Uncertainty,
         Field(description="[uncertainty](../explanation/uncertainty.md) of the calibration in the registers"),
     ]
     words: Annotated[list[RegisterWord], Field(description="the registers, in the order of the profile")]
 
 
-class Certificate(Model):
+class Certificate(tc.schema.Model):
     """Everything that follows from a recording, its profile and its station
     file, and nothing else."""
 
@@ -107,10 +110,11 @@ class Certificate(Model):
     ]
     outside: Annotated[list[str], Field(description="figures that are outside their limits, in words")]
     result: Annotated[
-        dict[str, Any],
+        tc.schema.Loop | tc.schema.Rezero,
         Field(
-            description="the [`triaxcal.loop/1`](documents.md#loop), "
-            "or after `--rezero` the [`triaxcal.rezero/1`](documents.md#biases-anew)"
+            discriminator="format",
+            description="the [`triaxcal.loop/1`](loop.md), "
+            "or after `--rezero` the [`triaxcal.rezero/1`](loop.md#rezero)",
         ),
     ]
     not_written: Annotated[

@@ -6,14 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+import triaxcal as tc
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.codes import Code, Verdict
-from triaxcald.schema.figures import Residual
-from triaxcald.schema.model import Figure, Model, Sha256, Text, Word
 from triaxcald.schema.verification import Verification
 
 
-class RegistersDone(Model):
+class RegistersDone(tc.schema.Model):
     differing: Annotated[list[str], Field(description="registers that differed from what was wanted")]
     written: Annotated[list[str], Field(description="registers that were written, in this order")]
     marked: Annotated[
@@ -28,54 +27,58 @@ class RegistersDone(Model):
         bool, Field(description="whether an earlier provisioning had left the device in between")
     ]
     undoing_failed: Annotated[
-        Text | None, Field(description="reason that the old calibration is not back; else `null`")
+        tc.schema.Text | None, Field(description="reason that the old calibration is not back; else `null`")
     ]
     steps: Annotated[list[str], Field(description="steps of the procedure, in order, in words")]
 
 
-class LimitsOfOutcome(Model):
-    rms_g: Annotated[Figure | None, Field(description="of the fit's residual, rms [g]")] = None
-    cross_validated_rms_g: Annotated[Figure | None, Field(description="of the fit, cross-validated rms [g]")] = None
+class LimitsOfOutcome(tc.schema.Model):
+    rms_g: Annotated[tc.schema.Figure | None, Field(description="of the fit's residual, rms [g]")] = None
+    cross_validated_rms_g: Annotated[
+        tc.schema.Figure | None, Field(description="of the fit, cross-validated rms [g]")
+    ] = None
     verification_rms_g: Annotated[
-        Figure | None, Field(description="of the device's own output in the check poses, rms [g]")
+        tc.schema.Figure | None, Field(description="of the device's own output in the check poses, rms [g]")
     ] = None
 
 
-class Measured(Model):
-    raw_sha256: Annotated[Sha256, Field(description="digest of the raw records of the phase `calibration`")]
+class Measured(tc.schema.Model):
+    raw_sha256: Annotated[tc.schema.Sha256, Field(description="digest of the raw records of the phase `calibration`")]
     poses: Annotated[int, Field(description="number of still poses")]
-    before: Annotated[Residual, Field(description="of the linear model; after `--rezero`, of the earlier calibration")]
-    after: Annotated[Residual, Field(description="of the final calibration; keys as `measured.before`")]
+    before: Annotated[
+        tc.schema.Residual, Field(description="of the linear model; after `--rezero`, of the earlier calibration")
+    ]
+    after: Annotated[tc.schema.Residual, Field(description="of the final calibration; keys as `measured.before`")]
     terms: Annotated[list[str], Field(description="`linear`, and the effects of the final calibration")]
     left_to_host: Annotated[list[str], Field(description="effects for which the device has no registers")]
 
 
-class AttachmentListed(Model):
+class AttachmentListed(tc.schema.Model):
     name: Annotated[str, Field(description="its name")]
     media_type: Annotated[str, Field(description="its media type")]
     time_ns: Annotated[int, Field(description="log time, since 1970 UTC [ns]")]
-    sha256: Annotated[Sha256, Field(description="digest of its bytes")]
+    sha256: Annotated[tc.schema.Sha256, Field(description="digest of its bytes")]
 
 
-class MetadataListed(Model):
+class MetadataListed(tc.schema.Model):
     name: Annotated[str, Field(description="name of the record")]
-    sha256: Annotated[Sha256, Field(description="digest of its keys and values, sorted")]
+    sha256: Annotated[tc.schema.Sha256, Field(description="digest of its keys and values, sorted")]
 
 
-class TopicListed(Model):
+class TopicListed(tc.schema.Model):
     name: Annotated[str, Field(description="its name")]
     messages: Annotated[int, Field(description="number of its messages")]
-    sha256: Annotated[Sha256, Field(description="digest of the times and bytes of its messages")]
-    declared: Annotated[Sha256, Field(description="digest of its declarations: channels and schemas")]
+    sha256: Annotated[tc.schema.Sha256, Field(description="digest of the times and bytes of its messages")]
+    declared: Annotated[tc.schema.Sha256, Field(description="digest of its declarations: channels and schemas")]
 
 
-class Contents(Model):
+class Contents(tc.schema.Model):
     attachments: Annotated[list[AttachmentListed], Field(description="attachments, in the order of the file")]
     metadata: Annotated[list[MetadataListed], Field(description="metadata records, by name")]
     topics: Annotated[list[TopicListed], Field(description="topics, by name")]
 
 
-class Outcome(Model):
+class Outcome(tc.schema.Model):
     """What became of a unit, and what its device holds."""
 
     format: Annotated[Literal["triaxcal.outcome/1"], Field(description="format of this document")]
@@ -83,21 +86,24 @@ class Outcome(Model):
     serial: Annotated[str | None, Field(description="serial number; `null` without one")]
     station: Annotated[str, Field(description="name of the station")]
     ended: Annotated[str, Field(description="end of the work, UTC, ISO 8601")]
-    verdict: Annotated[Word[Verdict], Field(description="[verdict](#verdict-and-code) on the unit")]
+    verdict: Annotated[tc.schema.Word[Verdict], Field(description="[verdict](#verdict-and-code) on the unit")]
     code: Annotated[
-        Word[Code] | None,
+        tc.schema.Word[Code] | None,
         Field(description="[reason for programs](#verdict-and-code); `null` after bad input and after a dry run"),
     ] = None
-    reason: Annotated[Text, Field(description="reason for people, one sentence")]
+    reason: Annotated[tc.schema.Text, Field(description="reason for people, one sentence")]
     exit_code: Annotated[
         int | None, Field(description="exit code of the command for this unit; `null` after an internal error")
     ]
     device_state: Annotated[
-        Word[DeviceState], Field(description="which calibration the device holds: [device state](#device-state)")
+        tc.schema.Word[DeviceState],
+        Field(description="which calibration the device holds: [device state](#device-state)"),
     ]
-    evidence: Annotated[Word[Evidence], Field(description="what `device_state` rests on: [evidence](#device-state)")]
+    evidence: Annotated[
+        tc.schema.Word[Evidence], Field(description="what `device_state` rests on: [evidence](#device-state)")
+    ]
     observed: Annotated[
-        list[Word[Observation]],
+        list[tc.schema.Word[Observation]],
         Field(
             default_factory=list,
             description="what was seen of the device since the last write: [observations](#device-state)",
@@ -107,10 +113,10 @@ class Outcome(Model):
         RegistersDone | None, Field(description="what was done to the registers; `null` if nothing was to be written")
     ]
     forced: Annotated[
-        Text | None, Field(description="reason of `--force`, if it overruled sanity warnings; else `null`")
+        tc.schema.Text | None, Field(description="reason of `--force`, if it overruled sanity warnings; else `null`")
     ]
     journal: Annotated[
-        Text | None, Field(description="path of the [journal](#journal) while it is needed; else `null`")
+        tc.schema.Text | None, Field(description="path of the [journal](#journal) while it is needed; else `null`")
     ]
     limits: Annotated[
         LimitsOfOutcome,

@@ -18,6 +18,7 @@ from triaxcal.model.bias_directions import bias_directions
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
+from triaxcald.documents import to_text
 
 Run = Callable[..., Any]
 UNIT = Sensor(np.array([-2.41, 2.0, 3.1]), np.array([6e-3, 4e-3, -6e-3]), np.array([5e-3, -3e-3, 4e-3]))
@@ -63,6 +64,9 @@ def test_the_document_has_the_new_biases_and_says_what_it_is_of(workshop: Any, t
     }
     assert document["rezero"]["before"]["rms_g"] > 5 * document["residual"]["rms_g"]
     assert {line["source"] for line in document["uncertainty"]["budget"]} >= {"noise", "kept", "since"}
+    read = tc.schema.Calibration.read(document)
+    assert read is not None
+    assert to_text(read.document()) == to_text(document)
     # As another program of ours reads it.
     found = calibration_of(document, where="document")
     assert np.isfinite(found.covariance).all()

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import triaxcal as tc
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcald.cli.commands import parser
 from triaxcald.cli.syntax import parsed
+from triaxcald.documents import to_text
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
@@ -86,6 +88,9 @@ def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], tr
         assert name.endswith("_run2")
         assert value["value"] == pytest.approx(1.5e-3, abs=5 * value["standard_error"])
     assert document["calibration"]["channel_reference"] == {"run_index": 0.0}
+    read = tc.schema.Loop.read(document)
+    assert read is not None
+    assert to_text(read.document()) == to_text(document)
 
 
 def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -> None:

@@ -92,7 +92,8 @@ def test_a_command_that_there_is_not_is_answered_with_the_nearest(
 
 @pytest.mark.parametrize("module", ["provisioning", "stations", "measuring", "fitting"])
 def test_a_command_begins_without_the_models_of_documents(module: str) -> None:
-    code = f"import sys, triaxcald.cli.{module}; print(*(m for m in sys.modules if m.startswith('triaxcald.schema.')))"
+    models = "(m for m in sys.modules if m.startswith(('triaxcald.schema.', 'triaxcal.schema')))"
+    code = f"import sys, triaxcald.cli.{module}; print(*{models})"
     done = _python(code)
     assert done.returncode == 0, done.stderr
     assert set(done.stdout.split()) <= {"triaxcald.schema.codes"}

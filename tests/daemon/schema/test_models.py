@@ -15,24 +15,32 @@ from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Verdict
-from triaxcald.schema.figures import Residual
-from triaxcald.schema.model import Model, json_schema
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.verification import Verification
 
 RECORDINGS = Path(__file__).parents[3] / "recordings"
 EVERY = sorted(RECORDINGS.rglob("*.mcap"))
-MODELS: dict[str, type[Model]] = {
+MODELS: dict[str, type[tc.schema.Model]] = {
     "outcome.json": Outcome,
     "certificate.json": Certificate,
     "verification.json": Verification,
+    "certificate.json/result": tc.schema.Loop,
+    "certificate.json/result/calibration": tc.schema.Calibration,
 }
 
 
 @cache
 def stored(path: Path, name: str) -> bytes:
+    """An attachment, or the part of it at a key and the keys below."""
+    attachment, *keys = name.split("/")
     with Recording.open(path) as recording:
-        return recording.attachments[name]
+        data = recording.attachments[attachment]
+    if not keys:
+        return data
+    document = json.loads(data)
+    for key in keys:
+        document = document[key]
+    return to_text(document).encode()
 
 
 def golden(name: str) -> dict[str, Any]:
@@ -75,15 +83,15 @@ def test_anything_else_is_not_read(name: str, value: object) -> None:
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "1", True])
 def test_a_figure_is_a_finite_number(value: object) -> None:
-    figures = dict.fromkeys(Residual.model_fields, 1.0)
-    assert Residual.read(figures) is not None
-    assert Residual.read(figures | {"rms_g": value}) is None
+    figures = dict.fromkeys(tc.schema.Residual.model_fields, 1.0)
+    assert tc.schema.Residual.read(figures) is not None
+    assert tc.schema.Residual.read(figures | {"rms_g": value}) is None
 
 
 def test_a_figure_keeps_what_an_audit_needs_of_it() -> None:
     rms_g = tc.rounding.error(1.23456789e-5)
     assert isinstance(rms_g, tc.rounding.Printed)
-    found = Residual(
+    found = tc.schema.Residual(
         rms_g=rms_g, max_abs_g=None, cross_validated_rms_g=None, noise_floor_g=None, lack_of_fit_p=0.5
     ).document()
     assert found["rms_g"].exact == 1.23456789e-5
@@ -110,7 +118,20 @@ def test_a_key_that_a_later_version_adds_is_ignored() -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_json_schema_describes_every_key(name: str) -> None:
-    schema = json.loads(json_schema(MODELS[name]))
-    assert list(schema["properties"]) == list(golden(name))
+    schema, document = MODELS[name].model_json_schema(), golden(name)
+    keys = schema["$defs"][MODELS[name].__name__] if "$ref" in schema else schema
+    assert [key for key in keys["properties"] if key in document] == list(document)
     for properties in (node["properties"] for node in (schema, *schema["$defs"].values()) if "properties" in node):
         assert all(of["description"] for of in properties.values())
+
+
+def test_the_result_of_a_certificate_may_be_a_rezero() -> None:
+    loop, nothing = golden("certificate.json/result"), dict[str, Any](findings=[], candidates=[], choices=[], advice=[])
+    rezero = {key: loop[key] for key in tc.schema.Rezero.model_fields} | {"format": "triaxcal.rezero/1"} | nothing
+    document = golden("certificate.json") | {"result": rezero}
+    read = Certificate.read(document)
+    assert read is not None
+    assert isinstance(read.result, tc.schema.Rezero)
+    assert to_text(read.document()) == to_text(document)
+    assert Certificate.read(document | {"result": rezero | {"candidates": loop["candidates"]}}) is None
+    assert Certificate.read(document | {"result": rezero | {"format": "triaxcal.poses/1"}}) is None

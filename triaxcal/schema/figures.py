@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from triaxcald.schema.model import Figure, Model
+from triaxcal.schema.model import Figure, Figures, Model, Text
 
 
 class Residual(Model):
@@ -40,11 +40,11 @@ class Residual(Model):
 
 
 class ByParameter(Model):
-    scale_factor: Annotated[list[Figure | None], Field(description="of x, y, z [output/g]")]
-    misalignment: Annotated[list[Figure | None], Field(description="of the three angles [rad]")]
-    bias: Annotated[list[Figure | None], Field(description="of x, y, z [g]")]
+    scale_factor: Annotated[Figures, Field(description="of x, y, z [output/g]")]
+    misalignment: Annotated[Figures, Field(description="of the three angles [rad]")]
+    bias: Annotated[Figures, Field(description="of x, y, z [g]")]
     effects: Annotated[
-        dict[str, dict[str, Figure | None]],
+        dict[Text, dict[Text, Figure | None]],
         Field(
             default_factory=dict,
             description="of each effect, by coefficient [unit of the coefficient]; absent without effects",
@@ -60,7 +60,7 @@ class OfMagnitude(Model):
 
 class BudgetLine(Model):
     source: Annotated[
-        str,
+        Text,
         Field(
             description="`noise`, `creep`, `lack_of_fit`, `reference`, `temperature`, `thermometer`, "
             "`choice_of_effect`, `register_rounding`, `not_held` (effects that registers lack); after `--rezero` also "
@@ -69,11 +69,11 @@ class BudgetLine(Model):
     ]
     evaluation: Annotated[Literal["A", "B"], Field(description="`A` from scatter, else `B`")]
     degrees_of_freedom: Annotated[Figure | None, Field(description="degrees of freedom; `null` is infinite")]
-    scale_factor: Annotated[list[Figure | None], Field(description="standard uncertainties of x, y, z [output/g]")]
-    misalignment: Annotated[list[Figure | None], Field(description="standard uncertainties of the three angles [rad]")]
-    bias: Annotated[list[Figure | None], Field(description="standard uncertainties of x, y, z [g]")]
+    scale_factor: Annotated[Figures, Field(description="standard uncertainties of x, y, z [output/g]")]
+    misalignment: Annotated[Figures, Field(description="standard uncertainties of the three angles [rad]")]
+    bias: Annotated[Figures, Field(description="standard uncertainties of x, y, z [g]")]
     effects: Annotated[
-        dict[str, dict[str, Figure | None]],
+        dict[Text, dict[Text, Figure | None]],
         Field(
             default_factory=dict,
             description="standard uncertainties by effect and coefficient; absent without effects",
@@ -81,9 +81,9 @@ class BudgetLine(Model):
     ]
     magnitude_g: Annotated[Figure | None, Field(description="standard uncertainty of |a| [g]")]
     share: Annotated[Figure | None, Field(description="share of the variance of |a|, 0…1")]
-    how: Annotated[str, Field(description="derivation in words")]
+    how: Annotated[Text, Field(description="derivation in words")]
     assumes: Annotated[
-        list[str], Field(default_factory=list, description="effects whose size is assumed; absent without any")
+        list[Text], Field(default_factory=list, description="effects whose size is assumed; absent without any")
     ]
 
 
@@ -95,7 +95,7 @@ class Uncertainty(Model):
     coverage_factor: Annotated[ByParameter, Field(description="Student's t of each parameter")]
     magnitude: Annotated[OfMagnitude, Field(description="of |a| over all orientations")]
     budget: Annotated[list[BudgetLine], Field(description="standard uncertainties by source, largest first")]
-    dominant: Annotated[str, Field(description="the largest source")]
-    halved_by: Annotated[str, Field(description="an action that halves it, in words")]
+    dominant: Annotated[Text, Field(description="the largest source")]
+    halved_by: Annotated[Text, Field(description="an action that halves it, in words")]
     magnitude_if_halved_g: Annotated[Figure | None, Field(description="standard uncertainty of |a| then [g]")]
-    not_evaluated: Annotated[list[str], Field(description="unknown sources, and what to state, in words")]
+    not_evaluated: Annotated[list[Text], Field(description="unknown sources, and what to state, in words")]

@@ -1,9 +1,7 @@
-"""What the models of documents have in common."""
+"""The base of the models of documents, and the values that they have in common."""
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Self, TypeVar
@@ -19,7 +17,6 @@ from pydantic import (
 )
 
 E = TypeVar("E", bound=StrEnum)
-_LINK = re.compile(r"\[([^]]+)\]\([^)]*\)")
 
 
 def _as_given(value: Any, handler: ValidatorFunctionWrapHandler) -> float:
@@ -44,6 +41,12 @@ Figure = Annotated[float, WrapValidator(_as_given)]
 Word = Annotated[E, Field(strict=False), PlainSerializer(str)]
 """A word out of a list. Documents hold it as text."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+Figures = list[Figure | None]
+"""A number that does not exist is `null`."""
+Vector = Annotated[list[Figure], Field(min_length=3, max_length=3)]
+"""Of x, y, z."""
+Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
+"""Row by row."""
 
 
 class Model(BaseModel):
@@ -67,10 +70,3 @@ class Model(BaseModel):
             return cls.model_validate(value) if isinstance(value, Mapping) else None
         except ValidationError:
             return None
-
-
-def json_schema(model: type[Model]) -> str:
-    """As text, with a newline at its end. The links in descriptions are those
-    of the page of the reference, and stay there."""
-    document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
-    return _LINK.sub(r"\1", json.dumps(document, indent=2, ensure_ascii=False)) + "\n"

@@ -1,0 +1,45 @@
+"""One model for each document of the metrology: it checks what is written, reads
+what was written, and yields the JSON Schema and the page of the reference.
+
+The one room that imports pydantic. Nothing imports it until a document is
+checked or read.
+"""
+
+from triaxcal.schema.calibration import Calibration
+from triaxcal.schema.figures import Residual, Uncertainty
+from triaxcal.schema.loop import (
+    AnotherUnit,
+    Candidate,
+    Choice,
+    Curve,
+    Finding,
+    HeldOut,
+    Loop,
+    Rezero,
+    Trace,
+    Unexplained,
+)
+from triaxcal.schema.model import Figure, Model, Sha256, Text, Word
+from triaxcal.schema.poses import Poses
+
+__all__ = [
+    "AnotherUnit",
+    "Calibration",
+    "Candidate",
+    "Choice",
+    "Curve",
+    "Figure",
+    "Finding",
+    "HeldOut",
+    "Loop",
+    "Model",
+    "Poses",
+    "Residual",
+    "Rezero",
+    "Sha256",
+    "Text",
+    "Trace",
+    "Uncertainty",
+    "Unexplained",
+    "Word",
+]
