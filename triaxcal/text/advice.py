@@ -15,6 +15,8 @@ from triaxcal.number_format import plain
 from triaxcal.planning.addition import ChannelRange
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_in_words import moment, the_poses
+from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.another_day import Scopes
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999
@@ -66,6 +68,7 @@ def _without_recording(loop: Loop) -> str:
 def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     """What to do, an action a line, the most urgent first."""
     yield from [*_poses_again(loop), *_apart(loop), *_next(loop, small)] or [_without_recording(loop)]
+    yield from _meanwhile(loop, small)
     if loop.held_out is not None and loop.held_out.worse:
         before, after = small.in_full(loop.held_out.before_rms_g), small.in_full(loop.held_out.after_rms_g)
         yield (
@@ -74,7 +77,20 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
         )
     for finding in loop.findings:
         if finding.verdict is Verdict.ADOPTED:
-            yield f"{finding.effect}: {finding.remedy}"
+            yield f"{finding.effect}: this calibration corrects it. In general: {finding.remedy}"
+
+
+def _meanwhile(loop: Loop, small: ErrorUnit) -> Iterator[str]:
+    """What the calibration is good for before the cause is known."""
+    if loop.call is Recommendation.RECORD_MORE:
+        yield "the calibration can be used meanwhile: its uncertainty contains what is not certain"
+    if loop.call is Recommendation.INVESTIGATE and loop.found.change_point is None:
+        scopes = Scopes.of(loop.after, budget(loop.after), loop.next_recording)
+        session = small.in_full(scopes.this_session)
+        yield (
+            "until the cause is known, use the calibration only where an expanded uncertainty of "
+            f"{session} in the poses of this session is enough"
+        )
 
 
 def notes(loop: Loop, small: ErrorUnit) -> Iterator[str]:
@@ -126,7 +142,8 @@ def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     if beside := [_other_action(action) for action in actions if action.kind in (ActionKind.LOG, ActionKind.HOLD)]:
         yield "; ".join(beside)
     if poses := [_pose(action, loop) for action in actions if action.kind not in (ActionKind.LOG, ActionKind.HOLD)]:
-        yield f"record next, to tell what acts, in this order: {', then '.join(poses)}"
+        order = ", in this order" if len(poses) > 1 else ""
+        yield f"record next, to tell what acts{order}: {', then '.join(poses)}"
     if loop.too_uncertain:
         following = loop.next_recording
         start, whole = small.in_full(following.start_to_start), small.in_full(following.standard)

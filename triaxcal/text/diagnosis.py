@@ -56,7 +56,7 @@ def lines(
 
 def _corrects(weights: Mapping[str, float]) -> str:
     if Empirical().name in weights:
-        return "is a smooth function of the direction, the mean over all that may act"
+        return "is a smooth function of the direction, without a physical meaning"
     return f"averages over {_each(weights)}"
 
 

@@ -372,6 +372,9 @@ PANEL_IN = (4.2, 2.9)
 INKS = tc.pictures.Inks(used=FLOOR, excluded=MUTED, curve=AFTER, band=BAND, zero=MUTED)
 MOST = 12
 """Panels of one document: three for each of four effects."""
+LEAST_DRAWN = 0.05
+"""Probability of an effect that is drawn although nothing names it: the
+correction contains that share of it, and less is thinner than the line."""
 
 
 @dataclass(frozen=True)
@@ -388,8 +391,20 @@ class Panel:
 def trace_panels(value: object, outcome: Outcome, unit: tc.units.ErrorUnit = MICRO_G) -> tuple[Panel, ...]:
     """Of the ``traces`` of a document; of one that has none the residuals in
     standard errors, as far as these are known."""
-    known = list(read_traces(value))[:MOST] or list(_residuals(outcome.poses))
+    drawable = list(read_traces(value))
+    telling = [trace for trace in drawable if _tells(trace, outcome)] or drawable
+    known = telling[:MOST] or list(_residuals(outcome.poses))
     return tuple(_panel(trace, outcome, unit, f"trace{i}") for i, trace in enumerate(known))
+
+
+def _tells(trace: tc.evidence.Trace, outcome: Outcome) -> bool:
+    """Whether a panel shows anything: an effect that is named, or probable enough
+    to be seen in the correction, or a curve that chance seldom makes."""
+    if trace.share is not None:
+        return trace.p_value is None or trace.p_value <= tc.poses.SIGNIFICANT
+    named = not trace.effect or trace.effect in {f.effect for f in outcome.findings}
+    probability = outcome.averaged.get(trace.effect)
+    return named or probability is None or probability >= LEAST_DRAWN
 
 
 def read_traces(value: object) -> Iterator[tc.evidence.Trace]:
@@ -472,10 +487,10 @@ def _caption(trace: tc.evidence.Trace, outcome: Outcome) -> str:
     if trace.share is not None:
         return _of_curve(trace.share, trace.p_value)
     if trace.effect == tc.text.traces.SMOOTH:
-        return "The mean over all that may act, as a function of the direction"
+        return "What the correction adds in each pose, and what the poses show. It has no physical meaning."
     finding = next((f for f in outcome.findings if f.effect == trace.effect), None)
     if finding is None:
-        return f"Probability {chance(outcome.averaged.get(trace.effect))}, and corrected by as much"
+        return f"Probability {chance(outcome.averaged.get(trace.effect))}; the correction contains that share of it"
     return _of_finding(finding)
 
 

@@ -26,6 +26,8 @@ from triaxcald.report.meanings import told
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
+_SMOOTHED = "Cause unknown, corrected by a smooth function of the direction"
+_SMOOTH = " The correction is a smooth function of the direction, without a physical meaning."
 _NO_LIMIT = "No limit was declared; the verdict compares with the noise floor alone."
 _WHAT_IS_LEFT = {
     True: "something acts that no known effect describes",
@@ -133,9 +135,11 @@ def _judged(
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
     if _unexplained(outcome) or outcome.another_unit:
         kept = "Every declared limit is kept, but " if checks and not open_checks and not failed else ""
-        left = _ANOTHER if outcome.another_unit else _WHAT_IS_LEFT[outcome.searched]
-        headline = _called(outcome, _ANOTHER[0].upper() + _ANOTHER[1:] if outcome.another_unit else _UNEXPLAINED)
-        what = f"{left}. {errors}"
+        smooth = tc.text.traces.SMOOTH in outcome.averaged
+        left = _ANOTHER if outcome.another_unit else _left(outcome)
+        unexplained = _SMOOTHED if smooth else _UNEXPLAINED
+        headline = _called(outcome, _ANOTHER[0].upper() + _ANOTHER[1:] if outcome.another_unit else unexplained)
+        what = f"{left}.{_SMOOTH if smooth and not outcome.another_unit else ''} {errors}"
         if _spoiled(outcome) or _rejected(outcome):
             headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
@@ -150,6 +154,12 @@ def _judged(
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
+
+
+def _left(outcome: Outcome) -> str:
+    """What is unexplained, with its probability and size where they are known."""
+    known = outcome.unexplained.lead if outcome.unexplained is not None else ""
+    return known or _WHAT_IS_LEFT[outcome.searched]
 
 
 def _called(outcome: Outcome, headline: str) -> str:
@@ -207,7 +217,7 @@ def _found(outcome: Outcome) -> str:
     if not outcome.findings and tc.text.traces.SMOOTH in outcome.averaged:
         return (
             "Something acts that no known effect describes. "
-            "The correction is a smooth function of the direction, the mean over all that may act. "
+            "The correction is a smooth function of the direction, without a physical meaning. "
         )
     if not outcome.findings and outcome.averaged:
         each = ", ".join(
@@ -235,6 +245,10 @@ def _named(finding: Finding, outcome: Outcome) -> str:
         clauses.append(f"{known.clause} ({', '.join(beside)})" if beside else known.clause)
     clauses += ["others"] if len(names) > _MOST_NAMED else []
     doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
+    if finding.hangs_on_a_pose:
+        doubt = ", but a single pose decides it"
+    if finding.verdict == CANDIDATE and finding.in_model:
+        doubt += "; it is corrected"
     return " or ".join(clauses) + doubt
 
 
@@ -287,7 +301,8 @@ def _errors(outcome: Outcome) -> str:
     if weighted and weighted[-1] is not None:
         before = f", {ratio(weighted[0])} before" if len(weighted) > 1 else ""
         in_errors = f"; residuals in standard errors: {ratio(weighted[-1])} rms{before}"
-    return f"{text}; noise floor {micro_g(floor_g, unit)}{in_errors}."
+    crossed = "; not cross-validated" if name == "residual" and outcome.averaged else ""
+    return f"{text}; noise floor {micro_g(floor_g, unit)}{in_errors}{crossed}."
 
 
 def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: tc.units.ErrorUnit) -> list[str]:
