@@ -121,8 +121,8 @@ class Loop:
         """What the poses show of each finding and each candidate, against what
         drives it; where there are none, of the likeliest effects that are
         corrected all the same. Of what has no name, against the variables that
-        tell most of it, with the first finding in the model; the readings first
-        where it goes with the direction. Where the unit or
+        tell most of it, with the findings in the model and without what corrects
+        it; the readings first where it goes with the direction. Where the unit or
         its mounting changed, or no effect probably acts, the residuals."""
         rows = self.posterior.evidence.rows
         names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
@@ -130,12 +130,19 @@ class Loop:
         of_names = [of_effect(rows, self.conditional_on.get(name, self.after), name) for name in names]
         something = self.found.nothing < self.posterior.evidence.odds.reported
         unnamed = self.found.unexplained.significant or (something and not names and not self.found.outliers)
-        with_finding = self.conditional_on.get(self.findings[0].effect, self.after) if self.findings else self.after
         by_direction = unnamed and self.found.unexplained.kind in OF_DIRECTION
         shown = unnamed and self.found.change_point is None
-        of_rest = telling_variables(rows, with_finding, by_direction) if shown else ()
+        of_rest = telling_variables(rows, self._with_findings(), by_direction) if shown else ()
         found = (*(trace for each in of_names for trace in each), *of_rest)
         return (*found, residuals(self.after)) if self.found.change_point or not found else found
+
+    def _with_findings(self) -> Calibration:
+        """The calibration with the findings as its only effects."""
+        if not self.findings:
+            return self.before
+        c = self.conditional_on.get(self.findings[0].effect, self.after)
+        names = {f.effect for f in self.findings}
+        return replace(c, sensor=replace(c.sensor, effects=tuple(e for e in c.sensor.effects if e[0].name in names)))
 
     @property
     def averaged(self) -> Mapping[str, float]:

@@ -397,6 +397,12 @@ def trace_panels(value: object, outcome: Outcome, unit: tc.units.ErrorUnit = MIC
     return tuple(_panel(trace, outcome, unit, f"trace{i}") for i, trace in enumerate(known))
 
 
+def no_variable_tells(value: object) -> bool:
+    """Whether the curves against single variables show no more than chance does."""
+    curves = [trace for trace in read_traces(value) if trace.share is not None]
+    return bool(curves) and all(t.p_value is not None and t.p_value > tc.poses.SIGNIFICANT for t in curves)
+
+
 def _tells(trace: tc.evidence.Trace, outcome: Outcome) -> bool:
     """Whether a panel shows anything: an effect that is named, or probable enough
     to be seen in the correction, or a curve that chance seldom makes."""

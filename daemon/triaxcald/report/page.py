@@ -25,6 +25,7 @@ from triaxcald.report.charts import (
     bars_picture,
     bracket,
     moments_in,
+    no_variable_tells,
     overview_of,
     sphere_pictures,
     stream_pictures,
@@ -175,6 +176,7 @@ def render_report(
         uncertainty=uncertainty,
         assumed=assumed,
         traces=trace_panels(document.get("traces"), outcome, unit),
+        no_variable_tells=no_variable_tells(document.get("traces")),
         bars=bars_picture(outcome.stages, outcome.held_out, unit),
         sphere=sphere_pictures(outcome.poses, outcome.stages, floor_g, unit),
         over_time=time_pictures(

@@ -223,9 +223,8 @@ def test_what_no_effect_describes_is_told_in_the_words_of_the_document(words: di
     words["unexplained"] = {"significant": True, "probability": 0.98, "kind": "time", "rms_g": 2.81e-4, "lead": lead}
     html, text = page(words)
     assert 'class="verdict unexplained"' in html
-    assert "Something acts that no known effect describes." in text
     assert f"Something acts that no known effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}." in text
-    assert text.count(HOSTILE) == 1
+    assert text.count(HOSTILE) == 2
     words["unexplained"]["lead"] = None
     assert "Something acts that no known effect describes, 281 µg rms." in page(words)[1]
 

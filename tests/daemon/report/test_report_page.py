@@ -289,7 +289,7 @@ def test_a_significant_remainder_is_unexplained_even_within_the_limits(bare: dic
     left = {"significant": True, "probability": 0.98, "rms_g": 4e-5, "lead": "something acts; it goes with the time"}
     page = render({**bare, "unexplained": left}, certificate=samples.certificate())
     assert page.verdict == "unexplained"
-    assert "Every declared limit is kept, but something acts that no known effect describes." in page.text
+    assert "Every declared limit is kept, but something acts; it goes with the time." in page.text
     assert "Something acts; it goes with the time." in page.text
 
 

@@ -23,6 +23,9 @@ samples = module_from_spec(_spec)
 _spec.loader.exec_module(samples)
 
 
+BY_Y = "Unexplained, by reading along y"
+
+
 def trace(**other: Any) -> dict[str, Any]:
     x = np.linspace(-1, 1, 9)
     return {
@@ -135,6 +138,21 @@ def test_where_nothing_is_found_the_picture_says_that_nothing_is_left(loop: dict
     assert "against time, s" in html
 
 
+@pytest.mark.parametrize(
+    ("p_value", "weight", "panels"),
+    [(1.0, 0.31, ["Warm up, axis y"]), (1e-3, 0.31, ["Warm up, axis y", BY_Y]), (1.0, 0.01, ["Warm up, axis y", BY_Y])],
+)
+def test_a_panel_that_shows_nothing_is_drawn_only_where_no_other_shows_more(
+    loop: dict[str, Any], p_value: float, weight: float, panels: list[str]
+) -> None:
+    known = {"x": {"value": 1e-4, "standard_error": 1e-4, "unit": "g"}, "weight": weight}
+    loop |= {"findings": [], "traces": [trace(effect="warm_up"), trace(effect=None, share=0.17, p_value=p_value)]}
+    loop["calibration"] |= {"terms": ["linear", "warm_up"], "effects": {"warm_up": known}}
+    html, text = page(loop)
+    assert [title for title in re.findall(r"<h3>(.*?)</h3>", html) if title in ("Warm up, axis y", BY_Y)] == panels
+    assert ("No single variable tells what acts" in text) == (p_value == 1.0)
+
+
 @pytest.mark.parametrize("nothing", [0.9, 0.1])
 def test_above_investigate_no_headline_says_that_nothing_is_found(loop: dict[str, Any], nothing: float) -> None:
     loop |= {"findings": [], "call": "investigate", "nothing_probability": nothing, "doubts": ["unit"]}
@@ -154,7 +172,7 @@ def test_an_averaged_correction_is_no_absence_of_effects(loop: dict[str, Any], n
     assert headline(html).startswith("Record more: no effect certain")
     assert "No effect beyond the linear model was found" not in text
     assert text.count("warm up (0.31)") == 2
-    assert "Probability 0.31, and corrected by as much" in text
+    assert "Probability 0.31; the correction contains that share of it" in text
     assert 'class="verdict unexplained"' in html
 
 
