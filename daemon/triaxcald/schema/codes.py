@@ -9,6 +9,27 @@ from enum import StrEnum
 from triaxcald.errors import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 
 
+class Stage(StrEnum):
+    """Stages of the work on a unit, in the order of a run."""
+
+    IDENTITY = "identity"
+    """The identity is read."""
+    POSES = "poses"
+    """Still poses are collected."""
+    FITTING = "fitting"
+    """The calibration is computed."""
+    WRITING = "writing"
+    """The registers are written and read back."""
+    POWER_OFF = "power_off"
+    """The operator switches the supply off."""
+    POWER_ON = "power_on"
+    """The operator switches the supply on."""
+    CHECK_POSES = "check_poses"
+    """Check poses are collected, of the device's own output."""
+    REPORT = "report"
+    """The report is written."""
+
+
 class Verdict(StrEnum):
     PASS = "pass"
     """Within every limit."""
@@ -65,6 +86,8 @@ class Code(StrEnum):
     """The memory ran out."""
     STOPPED = "stopped"
     """The work was interrupted."""
+    KILLED = "killed"
+    """The process was killed; the next start in the folder found its recording."""
     INTERNAL = "internal"
     """An error of this program."""
 
@@ -94,5 +117,5 @@ _ENDS_WITH: Mapping[Code, tuple[Verdict, int | None]] = {
     ),
     **dict.fromkeys((Code.DISK, Code.MEMORY), (Verdict.ABORTED, DISK)),
     Code.STOPPED: (Verdict.ABORTED, INTERRUPTED),
-    Code.INTERNAL: (Verdict.ABORTED, None),
+    **dict.fromkeys((Code.KILLED, Code.INTERNAL), (Verdict.ABORTED, None)),
 }  # fmt: skip

@@ -11,6 +11,9 @@ from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.codes import Code, Verdict
 from triaxcald.schema.verification import Verification
 
+WorkText = Annotated[str, Field(min_length=1, max_length=64)]
+Figures = list[tc.schema.Figure | None]
+
 
 class RegistersDone(tc.schema.Model):
     differing: Annotated[list[str], Field(description="registers that differed from what was wanted")]
@@ -42,6 +45,21 @@ class LimitsOfOutcome(tc.schema.Model):
     ] = None
 
 
+class StandardErrors(tc.schema.Model):
+    scale_factor: Annotated[Figures, Field(description="of x, y, z [output/g]")]
+    misalignment: Annotated[Figures, Field(description="of the three angles [rad]")]
+    bias: Annotated[Figures, Field(description="of x, y, z [g]")]
+
+
+class MeasuredCalibration(tc.schema.Model):
+    """The linear part of a calibration, as the certificate has it."""
+
+    scale_factor: Annotated[Figures, Field(description="of x, y, z [output/g]")]
+    misalignment: Annotated[Figures, Field(description="the three angles [rad]")]
+    bias: Annotated[Figures, Field(description="of x, y, z [g]")]
+    standard_error: Annotated[StandardErrors, Field(description="their standard errors")]
+
+
 class Measured(tc.schema.Model):
     raw_sha256: Annotated[tc.schema.Sha256, Field(description="digest of the raw records of the phase `calibration`")]
     poses: Annotated[int, Field(description="number of still poses")]
@@ -51,6 +69,9 @@ class Measured(tc.schema.Model):
     after: Annotated[tc.schema.Residual, Field(description="of the final calibration; keys as `measured.before`")]
     terms: Annotated[list[str], Field(description="`linear`, and the effects of the final calibration")]
     left_to_host: Annotated[list[str], Field(description="effects for which the device has no registers")]
+    calibration: Annotated[
+        MeasuredCalibration | None, Field(description="coefficients of the fit, of a failed unit too")
+    ] = None
 
 
 class AttachmentListed(tc.schema.Model):
@@ -78,6 +99,23 @@ class Contents(tc.schema.Model):
     topics: Annotated[list[TopicListed], Field(description="topics, by name")]
 
 
+class Work(tc.schema.Model):
+    """What a unit is measured for, as the operator, the station file or a program
+    gave it. Texts have 1 to 64 printable characters; `null` where not given."""
+
+    serial: Annotated[WorkText | None, Field(description="expected serial number")]
+    operator: Annotated[WorkText | None, Field(description="operator")]
+    order: Annotated[WorkText | None, Field(description="work order")]
+    batch: Annotated[WorkText | None, Field(description="batch")]
+    part_number: Annotated[WorkText | None, Field(description="part number")]
+    fixture: Annotated[WorkText | None, Field(description="fixture")]
+    slot: Annotated[str, Field(description="slot: name of the `[[units]]` entry")]
+    attempt: Annotated[
+        int | None, Field(ge=1, description="number of this attempt at the serial number in the folder, from 1")
+    ]
+    reason: Annotated[WorkText | None, Field(description="reason of a re-test")]
+
+
 class Outcome(tc.schema.Model):
     """What became of a unit, and what its device holds."""
 
@@ -85,7 +123,21 @@ class Outcome(tc.schema.Model):
     unit: Annotated[str, Field(description="name of the unit in the station file")]
     serial: Annotated[str | None, Field(description="serial number; `null` without one")]
     station: Annotated[str, Field(description="name of the station")]
+    run: Annotated[
+        str | None, Field(description="id of this attempt, a UUID of version 7; absent before version 0.3")
+    ] = None
+    started: Annotated[str | None, Field(description="start of the work, UTC, ISO 8601; absent before version 0.3")] = (
+        None
+    )
     ended: Annotated[str, Field(description="end of the work, UTC, ISO 8601")]
+    work: Annotated[Work | None, Field(description="what it was measured for; absent before version 0.3")] = None
+    recording: Annotated[tc.schema.Text | None, Field(description="file name of the recording; `null` without one")] = (
+        None
+    )
+    settles: Annotated[
+        str | None,
+        Field(description="id of the run that a `provision --resume` or `restore` settles; else `null`"),
+    ] = None
     verdict: Annotated[tc.schema.Word[Verdict], Field(description="[verdict](#verdict-and-code) on the unit")]
     code: Annotated[
         tc.schema.Word[Code] | None,
