@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcald.cli.console import Bars
+from triaxcald.cli.bars import Bars
 from triaxcald.run.unit_run import run_station
 from triaxcald.simulation.bench import DeviceFile, SyntheticPhysics, physics_of, simulate
 from triaxcald.station.config import load_station

@@ -4,7 +4,7 @@ with an effect hidden in it."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,8 +70,9 @@ class DemoUnit:
     kept: bool
 
 
-async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit]:
-    """Recordings, certificates and reports go to ``folder``. Raises InputError
+async def run_demo(folder: Path, seed: int, progress: Progress, ended: Callable[[Outcome], None]) -> list[DemoUnit]:
+    """Recordings, certificates and reports go to ``folder``; ``ended`` receives each
+    outcome. Raises InputError
     where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +85,7 @@ async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit
         servers = [await first.enter_async_context(unit.serve()) for unit in units]
         path = folder / "station.toml"
         write_text(path, _station(devices, channel, servers[1].bus.port))
-        outcomes = await run_station(load_station(path), progress)
+        outcomes = await run_station(load_station(path), progress, ended=ended)
         if any(outcome.exit_code == INTERRUPTED for outcome in outcomes):
             return [DemoUnit(u.truth, o, None, False, False) for u, o in zip(units, outcomes, strict=True)]
     # The plug is pulled on both: what follows knows nothing but their EEPROMs.

@@ -15,12 +15,16 @@ from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 from triaxcald.schema.codes import Code as Code
 from triaxcald.schema.codes import Verdict as Verdict
+from triaxcald.work import Attempt
 
 if TYPE_CHECKING:  # the models are loaded when a document is made
     from triaxcald.schema.outcome import Measured, RegistersDone
 
 FORMAT: Final = "triaxcal.outcome/1"
 ATTACHMENT, SUFFIX = "outcome.json", ".outcome.json"
+CERTIFICATE, REPORT = "certificate.json", "report.html"
+RUN_RECORD: Final = "run"
+"""Metadata record of a recording: the ids of run and tray, and the start."""
 
 
 @dataclass(frozen=True)
@@ -74,24 +78,36 @@ def outcome_document(
     supersedes: str | None,
     journal: str | None = None,
     forced: str | None = None,
+    attempt: Attempt | None = None,
 ) -> tc.interchange.Document:
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
-    needed, ``forced`` the reason for which sanity warnings were overruled."""
-    from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Outcome
+    needed, ``forced`` the reason for which sanity warnings were overruled;
+    ``attempt`` is None for an outcome as versions before 0.3 wrote it."""
+    from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Outcome, Work
     from triaxcald.schema.verification import Verification
 
     verification, contents = papers.verification, papers.contents
+    told: dict[str, Any] = {}
+    if attempt is not None:
+        told = {
+            "run": attempt.run,
+            "started": attempt.started,
+            "work": Work.model_validate(attempt.work.document()),
+            "recording": attempt.recording,
+            "settles": attempt.settles,
+        }
     return Outcome(
         format=FORMAT,
         unit=unit,
         serial=serial,
         station=station,
+        **told,
         ended=ended,
         verdict=ending.verdict,
         code=ending.code,
         reason=ending.reason,
-        exit_code=None if ending.code is Code.INTERNAL else ending.exit_code,
+        exit_code=None if ending.code in (Code.INTERNAL, Code.KILLED) else ending.exit_code,
         device_state=held.state,
         evidence=held.evidence,
         observed=held.observations,
@@ -112,9 +128,10 @@ def outcome_document(
 
 def measured_in(certificate: Mapping[str, Any]) -> Measured:
     """The figures of the fit, as the certificate has them."""
-    from triaxcald.schema.outcome import Measured
+    from triaxcald.schema.outcome import Measured, MeasuredCalibration
 
     recording, result = certificate["recording"], certificate["result"]
+    calibration = result["calibration"]
     return Measured(
         raw_sha256=recording["raw_sha256"],
         poses=recording["poses"],
@@ -122,7 +139,20 @@ def measured_in(certificate: Mapping[str, Any]) -> Measured:
         after=tc.schema.Residual.model_validate(result["after"]),
         terms=result["calibration"]["terms"],
         left_to_host=(certificate["registers"] or {}).get("left_to_host", []),
+        calibration=MeasuredCalibration.model_validate(
+            {**{name: calibration[name] for name in LINEAR}, "standard_error": errors_in(calibration)}
+        ),
     )
+
+
+LINEAR: Final = ("scale_factor", "misalignment", "bias")
+"""Coefficients of the linear model."""
+
+
+def errors_in(calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """Standard errors of the linear coefficients."""
+    errors = calibration["standard_error"]
+    return {name: errors[name] for name in LINEAR}
 
 
 def registers_told(p: Provisioning) -> RegistersDone:
@@ -144,18 +174,35 @@ def digest_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def latest_of(folder: Path, serial: str | None) -> str | None:
-    """The digest of the latest outcome of a unit in the station's folder; None
-    where there is none."""
-    if serial is None:
-        return None
-    found: list[tuple[str, str]] = []
-    for path in folder.glob(f"*{serial}-*{SUFFIX}"):
-        try:
-            data = path.read_bytes()
-            held = json.loads(data)
-        except (OSError, ValueError, RecursionError):  # not one of ours
-            continue
-        if isinstance(held, dict) and held.get("format") == FORMAT and held.get("serial") == serial:
-            found.append((str(held.get("ended", "")), digest_of(data)))
-    return max(found)[1] if found else None
+@dataclass(frozen=True)
+class History:
+    """Earlier attempts at a unit in the station's folder: the digest of the latest
+    outcome, None without one, and the number of attempts."""
+
+    latest: str | None = None
+    attempts: int = 0
+    passed: bool = False
+
+    @staticmethod
+    def of(folder: Path, serial: str | None) -> History:
+        """``serial`` is that of the unit, or the expected one of a unit that did not
+        answer."""
+        if serial is None:
+            return History()
+        found: list[tuple[str, str, bool]] = []
+        attempts = 0
+        for path in folder.glob(f"*{SUFFIX}"):
+            try:
+                data = path.read_bytes()
+                held = json.loads(data)
+            except (OSError, ValueError, RecursionError):  # not one of ours
+                continue
+            if not isinstance(held, dict) or held.get("format") != FORMAT:
+                continue
+            work = held.get("work")
+            meant = work.get("serial") if isinstance(work, dict) else None
+            if held.get("serial") == serial:
+                found.append((str(held.get("ended", "")), digest_of(data), held.get("verdict") == Verdict.PASS))
+            attempts += serial in (held.get("serial"), meant)
+        latest = max(found, default=None)
+        return History(latest[1], attempts, latest[2]) if latest else History(None, attempts)

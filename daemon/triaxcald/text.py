@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import triaxcal as tc
 from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.schema.codes import Stage, Verdict
 
 if TYPE_CHECKING:
     from triaxcald.provision.procedure import Provisioning
@@ -36,6 +37,19 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 
 
 IS_BACK = "the unit is back"
+STAGES = {
+    Stage.IDENTITY: "reading identity",
+    Stage.POSES: "poses",
+    Stage.FITTING: "fitting",
+    Stage.WRITING: "writing the registers",
+    Stage.POWER_OFF: "switch the supply off",
+    Stage.POWER_ON: "switch the supply on",
+    Stage.CHECK_POSES: "verifying by physics",
+    Stage.REPORT: "writing the report",
+}
+"""Stages of a run, for people."""
+VERDICTS = {Verdict.PASS: "PASS", Verdict.FAIL: "FAIL", Verdict.ABORTED: "STOPPED", Verdict.NOT_JUDGED: "NO LIMIT"}
+"""Verdicts, for people: the first word of a line."""
 BUS_IS_BACK = "the bus is back"
 NOTHING_YET = "nothing has come yet"
 DISK_IS_BEHIND = "records are lost: the disk does not keep up"
@@ -162,6 +176,22 @@ def bus_recorded(name: str, counts: Mapping[str, int], seconds: float) -> str:
     )
     came = f"{name}: {frames} of {identifiers} in {seconds:.1f} s"
     return f"{came}, {tc.number_format.number_of(counts['errors'], 'error frame')}" if counts["errors"] else came
+
+
+SWITCH_ON = "switch the supply of the unit on"
+
+
+KILLED = "the process was killed"
+
+
+def killed(slot: str, started: str, path: Path, outcome: Mapping[str, Any], station: Path) -> str:
+    """Of a run that ended without an outcome, which the next start has written."""
+    journal, device = outcome["journal"], ""
+    if journal is not None:
+        device = f"; {unfinished(Path(journal), slot, station)}"
+    elif outcome["device_state"] == DeviceState.UNTOUCHED:
+        device = "; no register was written"
+    return f"unit {slot}: the run of {started} was killed; its outcome is {path}{device}"
 
 
 def switch_supply(off_s: float) -> str:

@@ -3,7 +3,8 @@ command line or in the station file."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 RECORD: Final = "work"
@@ -33,6 +34,21 @@ class Work:
         held = asdict(self)
         return {key: held[key] for key in KEYS}
 
+    def record(self) -> dict[str, str]:
+        """As a metadata record of a recording: what is given, as text."""
+        return {key: str(value) for key, value in self.document().items() if value is not None}
+
+    @staticmethod
+    def recorded(record: Mapping[str, str]) -> Work:
+        """Back from a metadata record. Raises ValueError on a record that is none."""
+        known = {f.name for f in fields(Work)}
+        held: dict[str, Any] = {key: value for key, value in record.items() if key in known}
+        if "slot" not in held:
+            raise ValueError("no slot")
+        if "attempt" in held:
+            held["attempt"] = int(held["attempt"])
+        return Work(**held)
+
 
 KEYS: Final = ("serial", "operator", "order", "batch", "part_number", "fixture", "slot", "attempt", "reason")
 
@@ -44,3 +60,16 @@ def wrong(text: str) -> str | None:
     if not text.isprintable():
         return "expected printable characters alone"
     return None
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One attempt at a unit: ``run`` is its id, ``started`` its start (UTC, ISO 8601),
+    ``recording`` the file name of its recording, ``settles`` the id of the run that a
+    `provision --resume` or `restore` settles."""
+
+    run: str
+    started: str
+    work: Work
+    recording: str | None = None
+    settles: str | None = None

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
-from triaxcald.outcome import ATTACHMENT, SUFFIX, digest_of
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, digest_of
 from triaxcald.recording.mcap_records import ATTACHMENT_LIMIT
-from triaxcald.run.unit_run import CERTIFICATE, REPORT
 
 NAMES = (CERTIFICATE, REPORT, ATTACHMENT)
 

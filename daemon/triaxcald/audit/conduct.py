@@ -35,14 +35,13 @@ from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
-from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
-from triaxcald.run.unit_run import CERTIFICATE, REPORT
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 from triaxcald.software import drawn_with, software
 

@@ -18,7 +18,17 @@ from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
 from triaxcald.errors import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED, DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
-from triaxcald.outcome import ATTACHMENT, Code, Ending, Papers, Verdict, measured_in, outcome_document
+from triaxcald.outcome import (
+    ATTACHMENT,
+    CERTIFICATE,
+    RUN_RECORD,
+    Code,
+    Ending,
+    Papers,
+    Verdict,
+    measured_in,
+    outcome_document,
+)
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -26,7 +36,6 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
-from triaxcald.run.unit_run import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.schema.outcome import RegistersDone
 from triaxcald.station.config import StationFile, parse_station
@@ -38,6 +47,8 @@ from triaxcald.verification import (
     verification_document,
     verified,
 )
+from triaxcald.work import RECORD as WORK_RECORD
+from triaxcald.work import Attempt, Work
 
 CANNOT = (tc.TriaxcalError, td.DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
 """What a changed profile, station file or raw record may end in."""
@@ -172,7 +183,7 @@ def _certified(
 
 def _earlier(recording: Recording) -> EarlierFile | None:
     """The calibration of which the recording renews the biases alone."""
-    name = recording.metadata.get(RECORD, {}).get("calibration")
+    name = recording.metadata.get(WORK_RECORD, {}).get("calibration")
     if (name is None) != (EARLIER not in recording.attachments):
         raise RecordingError(f"attachment {EARLIER}: without its metadata {RECORD}, or the other way round")
     return None if name is None else EarlierFile.parsed(recording.attachments[EARLIER], name)
@@ -309,10 +320,30 @@ def outcome_again(
         supersedes=_text_in(stored, "supersedes"),
         journal=_text_in(stored, "journal"),
         forced=_text_in(stored, "forced"),
+        attempt=_attempt_in(stored, recording),
     )
     if not has_codes(stored):
         document = {name: value for name, value in document.items() if name not in ("code", "observed")}
     return document
+
+
+def _attempt_in(stored: Mapping[str, Any], recording: Recording) -> Attempt | None:
+    """The attempt: its id and its work as the recording's metadata have them. None in a
+    recording of a version before 0.3."""
+    held = recording.metadata.get(RUN_RECORD)
+    if held is None:
+        return None
+    try:
+        work = Work.recorded(recording.metadata.get(WORK_RECORD, {}))
+    except ValueError:
+        work = Work("")
+    return Attempt(
+        held.get("run", ""),
+        held.get("started", ""),
+        work,
+        _text_in(stored, "recording"),  # a file may have another name since
+        _text_in(stored, "settles"),
+    )
 
 
 def _text_in(stored: Mapping[str, Any], key: str) -> str | None:

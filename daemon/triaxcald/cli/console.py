@@ -8,21 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import triaxcal as tc
-from triaxcald.abort import add_action, discard_action, steer
 from triaxcald.printable import printable, printable_json
-from triaxcald.text import waits
-
-if TYPE_CHECKING:
-    from triaxcald.recording.schema import Phase
-    from triaxcald.station.guidance import Guide
-
 
 # What a command is at, told on standard error while it takes long: one line that is
 # written anew on a terminal, else a line every some seconds.
@@ -214,78 +206,3 @@ class _Output(Console):
 def micro(value: float | None) -> str:
     """A number of g in µg."""
     return tc.units.ErrorUnit().written(value)
-
-
-class _Shown(Console):
-    def on_broken_pipe(self) -> None:
-        """Stop the display after the reader has gone; rich would close standard output
-        too and end the program."""
-        self.quiet = True
-
-
-SHOW_CURSOR = "\x1b[?25h"
-
-
-class Bars:
-    """Progress bars, one a unit; plain lines where standard error is no
-    terminal."""
-
-    def __init__(self) -> None:
-        self._console = _Shown(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.fields[unit]:<8}", markup=False),
-            BarColumn(bar_width=26),
-            TextColumn("{task.completed:.0f}/{task.total:.0f} poses"),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}", markup=False),
-            console=self._console,
-            disable=not self._console.is_terminal,
-        )
-        self._tasks: dict[str, TaskID] = {}
-        self._said: dict[str, str] = {}
-
-    def __enter__(self) -> Bars:
-        add_action(self, self._show_cursor_at_abort)
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with suppress(OSError):
-            self._progress.stop()
-        discard_action(self)
-
-    def _show_cursor_at_abort(self, _: float) -> None:
-        """The bars hide it. Anything else of theirs could wait for a lock that
-        the main thread holds."""
-        if self._console.is_terminal:
-            steer(SHOW_CURSOR)
-
-    def _task(self, unit: str) -> TaskID:
-        if unit not in self._tasks:
-            self._tasks[unit] = self._progress.add_task("", total=1, unit=printable(unit))
-        return self._tasks[unit]
-
-    def stage(self, unit: str, what: str) -> None:
-        self._show(unit, description=printable(what))
-        self._plain(unit, what)
-
-    def lost(self, unit: str, trouble: str) -> None:
-        self.stage(unit, waits(trouble))
-
-    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
-        what = "check poses" if phase == "verification" else "poses"
-        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(f"{what}: {guide.hint}"))
-        # Seconds that go by are for a terminal; a log gets a line for each
-        # pose, and where to turn next.
-        if not guide.hint.startswith("hold still"):
-            hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
-            self._plain(unit, f"{what}: {guide.found} of {guide.wanted} directions{hint}")
-
-    def _show(self, unit: str, **values: Any) -> None:
-        with suppress(OSError):  # the terminal has gone; the work goes on
-            self._progress.update(self._task(unit), **values)
-
-    def _plain(self, unit: str, text: str) -> None:
-        if not self._console.is_terminal and self._said.get(unit) != text:
-            self._said[unit] = text
-            say(f"{unit}: {text}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import socket
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -31,7 +31,7 @@ class Interrupted(Exception):
         self.number, self.notes = number, notes
 
 
-def run_interruptible(work: Coroutine[Any, Any, T], reload: Callable[[], None] | None = None) -> T:
+def run_interruptible(work: Awaitable[T], reload: Callable[[], None] | None = None) -> T:
     """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled
     and did not make a result of that. ``reload`` is called in the loop at each
     SIGHUP, which then stops nothing, unless the process is on a terminal.
@@ -42,7 +42,7 @@ def run_interruptible(work: Coroutine[Any, Any, T], reload: Callable[[], None] |
         return asyncio.run(_guarded(work, signals, reload))
 
 
-async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: Callable[[], None] | None) -> T:
+async def _guarded(work: Awaitable[T], signals: StopSignals, reload: Callable[[], None] | None) -> T:
     loop = asyncio.get_running_loop()
     loop.set_default_executor(_Unawaited())
     loop.set_exception_handler(_told)

@@ -20,6 +20,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage
 from triaxcald.run.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
+from triaxcald.schema.codes import Stage
 from triaxcald.station.config import Place, days_since_1970, load_station
 
 
@@ -50,7 +51,7 @@ def _told(done: Provisioned, station: Path) -> str:
     return "; ".join(filter(None, [done.document["reason"], text.recovery_command(p, station)]))
 
 
-def _ask(what: str) -> None:
+def _ask(stage: Stage, what: str) -> None:
     say(what)
 
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import triaxcal as tc
 from triaxcald import text
-from triaxcald.cli.console import Bars, say
+from triaxcald.cli.bars import Bars
+from triaxcald.cli.console import say
 from triaxcald.cli.devices import of_a_journal, warn_of_a_journal
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.syntax import writable
@@ -29,6 +30,7 @@ from triaxcald.printable import printable_json
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.recording.schema import Phase
+from triaxcald.schema.codes import Code, Stage
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.config import Place, Station, changed, check_lines, load_station
 from triaxcald.station.guidance import Guide
@@ -54,14 +56,20 @@ class JsonLines:
     def __init__(self, out: TextIO | None = None, now: Callable[[], datetime] = _now) -> None:
         self._out, self._now = out or sys.stderr, now
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, text.STAGES[stage])
+
+    def note(self, unit: str, text: str) -> None:
         self.say("info", "stage", unit=unit, message=text)
 
-    def lost(self, unit: str, trouble: str) -> None:
-        self.say("warning", "lost", unit=unit, message=trouble)
+    def lost(self, unit: str, code: Code, reason: str) -> None:
+        self.say("warning", "lost", unit=unit, message=reason)
+
+    def back(self, unit: str) -> None:
+        self.note(unit, text.IS_BACK)
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
-        self.say("info", "poses", unit=unit, phase=phase, found=guide.found, wanted=guide.wanted, message=guide.hint)
+        self.say("info", "poses", unit=unit, phase=phase, found=guide.found, wanted=guide.wanted, message=guide.text)
 
     def say(self, level: str, event: str, **more: Any) -> None:
         """Nowhere, where nobody reads any more: no work may fail for it."""
@@ -166,7 +174,7 @@ async def _record(
 
             folder = a.output if a.folder else a.output.parent
             port = stack.enter_context(served(a.metrics, roster.statuses, folder))
-            progress.stage("record", text.metrics_at(port))
+            progress.note("record", text.metrics_at(port))
         await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
         roster.begin(_recordings(a, chosen, progress, serials))
         reloading = asyncio.ensure_future(_reload(a, chosen, roster, progress, serials, hangup))

@@ -8,13 +8,16 @@ import shutil
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald import text
-from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
+from triaxcald.cli.bars import Bars, verdict_line
+from triaxcald.cli.console import emit, micro, say, show, showing, table
+from triaxcald.cli.events import EventLines, Several
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError, severest
@@ -28,6 +31,8 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
 
 
 def run_command(a: argparse.Namespace) -> int:
+    if a.json and a.events:
+        raise InputError("--events: standard output has one JSON object a line, or with --json one document; give one")
     station = load_station(a.station)
     station.require_units()
     rezero = {}
@@ -39,15 +44,28 @@ def run_command(a: argparse.Namespace) -> int:
     from triaxcald.run.unit_run import run_station
     from triaxcald.schema.run import Run
 
-    with Bars() as bars:
-        outcomes = run_interruptible(run_station(station, bars, force=a.force, rezero=rezero, ended=say_error))
+    with ExitStack() as stack:
+        bars = stack.enter_context(Bars(place.unit.name for place in station.places))
+        receivers: list[Any] = [bars]
+
+        def ended(outcome: Outcome) -> None:
+            say_data_quality(outcome)
+            for receiver in receivers:
+                receiver.ended(outcome)
+
+        tray = run_station(
+            station, Several(receivers), force=a.force, rezero=rezero, ended=ended, killed=lambda k: say(k.line)
+        )
+        if a.events:
+            runs = {slot: unit.run for slot, unit in tray.units.items()}
+            receivers.append(stack.enter_context(EventLines(sys.stdout, tray.id, runs)))
+        outcomes = run_interruptible(tray)
     with showing(worst(outcomes), _told(outcomes)):
         if a.json:
             emit(Run(format="triaxcal.run/1", units=[_unit(o) for o in outcomes]).document())
-        else:
+        elif not a.events:
             for o in outcomes:
-                if o.error is None:
-                    show_outcome(o)
+                show_summary(o)
     return worst(outcomes)
 
 
@@ -99,11 +117,25 @@ def _text(path: Path | None) -> str | None:
     return str(path) if path else None
 
 
-def say_error(o: Outcome) -> None:
-    if o.error:
-        for line in o.data_quality:
-            say(f"warning: unit {o.unit}: {line}")
-        say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
+def say_data_quality(o: Outcome) -> None:
+    for line in o.data_quality:
+        say(f"warning: unit {o.unit}: {line}")
+
+
+def show_summary(o: Outcome) -> None:
+    """What became of a unit in a few lines; the report has the tables."""
+    show(verdict_line(o))
+    if o.certified is not None:
+        b, f = o.certified.before, o.certified.calibration.residual
+        fit = f"fit {micro(b.cross_validated_rms_g)} before, {micro(f.cross_validated_rms_g)} after"
+        own = o.verification
+        checked = f"; own output {micro(own['before_rms_g'])} before, {micro(own['after_rms_g'])} after" if own else ""
+        show(f"         µg rms: {fit}{checked}")
+        show(f"         terms: {', '.join(o.certified.calibration.terms)}")
+    if o.device_state is not None:
+        show(f"         {o.device_state}")
+    if (path := o.report or o.outcome) is not None:
+        show(f"         {path}")
 
 
 def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
@@ -174,10 +206,13 @@ def demo_command(a: argparse.Namespace) -> int:
     from triaxcald.demo import run_demo
     from triaxcald.schema.run import Demo
 
-    with Bars() as bars:
-        units = run_interruptible(run_demo(a.out, a.seed, bars))
-    for u in units:
-        say_error(u.outcome)
+    with Bars(("can", "modbus")) as bars:
+
+        def ended(outcome: Outcome) -> None:
+            say_data_quality(outcome)
+            bars.ended(outcome)
+
+        units = run_interruptible(run_demo(a.out, a.seed, bars, ended))
     code = worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
     with showing(code, ""):  # its devices are gone with it
         if a.json:

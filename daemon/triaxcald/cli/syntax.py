@@ -19,6 +19,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
+from triaxcald.work import wrong
 
 # Arguments that several commands share, and a parser whose errors are one line.
 
@@ -313,8 +314,12 @@ def _line(commands: Any) -> None:
         "--rezero", action="append", metavar="CAL",
         help="renew the three biases of this calibration alone, by plan.rezero_poses poses; of several units once each",
     )  # fmt: skip
+    _add_work(p)
     add_force(p)
     add_json(p)
+    p.add_argument(
+        "--events", action="store_true", help="one JSON object a line on standard output, as the work goes on"
+    )
     p = _command(
         commands, "sim", "stations:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
     )
@@ -348,6 +353,37 @@ def _line(commands: Any) -> None:
         "--metrics", type=port, metavar="PORT", help="numbers for Prometheus and a health page on the loopback"
     )
     p.add_argument("--log-format", choices=("text", "json"), default="text", help="of progress; json: an object a line")
+
+
+def _add_work(p: argparse.ArgumentParser) -> None:
+    """What the units are measured for."""
+    g = p.add_argument_group("work", "stored in recording, outcome and events; by default as in the station file")
+    g.add_argument(
+        "--serial", action="append", type=_slot_serial, default=[], metavar="SLOT=SERIAL",
+        help="expected serial number of a slot; of several slots once each",
+    )  # fmt: skip
+    for name, help_line in (
+        ("operator", "operator"),
+        ("order", "work order"),
+        ("batch", "batch"),
+        ("part-number", "part number"),
+        ("fixture", "fixture"),
+        ("reason", "reason of a re-test"),
+    ):
+        g.add_argument(f"--{name}", type=_work_text, metavar="TEXT", help=help_line)
+
+
+def _work_text(text: str) -> str:
+    if fault := wrong(text):
+        raise argparse.ArgumentTypeError(fault)
+    return text
+
+
+def _slot_serial(text: str) -> tuple[str, str]:
+    slot, equals, serial = text.partition("=")
+    if not equals or not slot:
+        raise argparse.ArgumentTypeError(f"expected SLOT=SERIAL as in left=1042, not '{text}'")
+    return slot, _work_text(serial)
 
 
 def _on_recordings(commands: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import triaxcal_drivers as td
@@ -20,9 +21,12 @@ def least_off_s(profile: td.Profile) -> float:
     return MISSED * (profile.sampling.reply_timeout_s + LOOK_S)
 
 
-async def power_cycled(link: RegisterLink, profile: td.Profile, patience_s: float) -> bool:
+async def power_cycled(
+    link: RegisterLink, profile: td.Profile, patience_s: float, off: Callable[[], None] = lambda: None
+) -> bool:
     """Whether the device, within ``patience_s``, answers, goes silent and answers
-    again. A busy or refusing device has its supply.
+    again. A busy or refusing device has its supply. ``off`` is called once it is
+    silent.
     """
     register = contact_register(profile) or next(iter(profile.registers))
     deadline_s, missed, answered = link.clock.now_s() + patience_s, 0, False
@@ -38,6 +42,7 @@ async def power_cycled(link: RegisterLink, profile: td.Profile, patience_s: floa
             missed += answered
             await link.renew()
         await link.clock.sleep(LOOK_S)
+    off()
     with suppress(td.DriverError):
         await reconnect(link, profile, max(deadline_s - link.clock.now_s(), LOOK_S))
         return True

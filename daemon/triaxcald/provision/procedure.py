@@ -174,6 +174,9 @@ class Provisioning:
     power_cycle: Callable[[], Awaitable[bool]] | None = None
     """Asks for a power cycle if no restart proves the stored values; returns whether
     the supply was seen off and on."""
+    on_settled: Callable[[Held], None] = lambda _: None
+    """Receives the state of a settled device before its journals are removed. Raises
+    DiskError."""
     held: Held = field(default_factory=Held)
     warnings: list[SanityWarning] = field(default_factory=list)
     differing: tuple[str, ...] = ()
@@ -215,6 +218,12 @@ class Provisioning:
     def examined(self) -> bool:
         """Whether the unit is identified and its registers are read."""
         return hasattr(self, "before")
+
+    @property
+    def settles(self) -> str | None:
+        """The id of the run whose journal this provisioning has removed, or would;
+        None if there was none."""
+        return next((entry.run for journal, entry in self._journals if entry.run), None)
 
     @property
     def resets(self) -> bool:
@@ -413,6 +422,7 @@ class Provisioning:
         if not self.examined:
             return
         if self.settled:
+            self.on_settled(self.held)
             for journal in (*self._earlier, *([self.journal] if self._journaled else [])):
                 journal.remove()
             self._earlier, self._journaled = [], False

@@ -3,12 +3,13 @@ counts what is lost."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
@@ -224,9 +225,18 @@ class Recovery:
         return not (self.raw_missing or self.bytes_dropped or self.undeclared_messages or self.unlocated_damage)
 
 
-def recover(path: Path, out: Path) -> Recovery:
-    """Writes what can be had of ``path`` to ``out``, a finished recording;
-    ``path`` is only read.
+class Sealed(NamedTuple):
+    """The document that a mended recording ends with, as its last attachment."""
+
+    name: str
+    media_type: str
+    time_ns: int
+    data: bytes
+
+
+def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sealed | None = None) -> Recovery:
+    """Writes what can be had of ``path`` to ``out``, a finished recording, but for the
+    attachments ``without``; ``path`` is only read. ``sealed`` becomes its end.
 
     Raises RecordingError: ``path`` is no recording of ours or cannot be read,
     ``out`` exists or cannot be written; Refused: ``path`` holds neither a whole
@@ -237,16 +247,16 @@ def recover(path: Path, out: Path) -> Recovery:
     try:
         with td.files.open_file(path) as source:
             damaged = DamagedFile(source, str(path))
-            return _write(damaged, path.name, out)
+            return _write(damaged, path.name, out, without, sealed)
     except FileExistsError:
         raise exists_already(out) from None
     except OSError as e:
         raise RecordingError(f"{e.filename or out}: {e.strerror}") from e
 
 
-def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
+def _write(damaged: DamagedFile, name: str, out: Path, without: Collection[str], sealed: Sealed | None) -> Recovery:
     with new_file(out) as sink:
-        recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
+        recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True), without, sealed).run(name)
         if not (recovery.messages or recovery.attachments):
             raise tc.Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
         return recovery
@@ -256,8 +266,8 @@ class _Mending:
     """Carries record after record from the damaged file to the new one,
     counting."""
 
-    def __init__(self, damaged: DamagedFile, mcap: McapWriter) -> None:
-        self._damaged = damaged
+    def __init__(self, damaged: DamagedFile, mcap: McapWriter, without: Collection[str], sealed: Sealed | None) -> None:
+        self._damaged, self._without, self._sealed = damaged, without, sealed
         self._mcap = mcap
         self._recovery = Recovery(cut_short=True)
         self._channel_ids: dict[int, int] = {}  # of the damaged file -> of the new one
@@ -298,6 +308,8 @@ class _Mending:
                 self._recovery.attachments_failed += 1
             return
         if isinstance(record, Attachment):
+            if record.name in self._without:
+                return
             self._recovery.attachments += 1
             self._mcap.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         elif isinstance(record, Metadata):
@@ -416,8 +428,14 @@ class _Mending:
     def _write_end(self, name: str) -> None:
         ends_with = {schema.ENDS_WITH: self._digest.ends_with} if self._digest.ends_with else {}
         self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT} | ends_with)
+        if self._sealed is not None:
+            at = self._sealed.time_ns
+            self._mcap.add_attachment(at, at, self._sealed.name, self._sealed.media_type, self._sealed.data)
         raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        if self._sealed is not None:
+            digest = hashlib.sha256(self._sealed.data).hexdigest()
+            self._mcap.add_metadata(schema.END_RECORD, {"name": self._sealed.name, "sha256": digest})
         story = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
         if "sha256" in self._written:
             story["sha256_when_written"] = self._written["sha256"]

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
 import triaxcal as tc
-import triaxcal_drivers as td
-from triaxcald import errors as exit_codes
 from triaxcald import text
 from triaxcald.certificate import exceeded
 from triaxcald.errors import (
     DEVICE,
     DISK,
     INTERRUPTED,
-    DeviceInUse,
-    DiskError,
-    Implausible,
-    NoPoses,
-    SerialTwice,
-    StationError,
-    TwoAnswer,
     exit_code_of,
 )
-from triaxcald.memory import ran_out_of_memory
 from triaxcald.outcome import Code, Ending, Verdict
 from triaxcald.printable import printable_lines
-from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import ReadingsNotStated
 from triaxcald.provision.state import DeviceState
-from triaxcald.run.reasons import is_internal
+from triaxcald.run.reasons import code_of as code_of
 from triaxcald.run.reasons import reason_of as reason_of
 from triaxcald.run.reasons import trace_of as trace_of
 from triaxcald.station.config import Limits
@@ -80,43 +68,3 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
 
 _WHO_IS_THERE = (Code.WRONG_UNIT, Code.TWO_ANSWER)
 """Codes that are more specific than "the device is not settled"."""
-
-
-def code_of(e: BaseException) -> Code | None:
-    """Code of an error: that of its first cause with a code of its own. None for bad
-    input."""
-    if ran_out_of_memory(e):
-        return Code.MEMORY
-    causes = [e]
-    while (cause := causes[-1].__cause__) is not None:
-        causes.append(cause)
-    for cause in causes:
-        for kind, code in _CODES:
-            if isinstance(cause, kind):
-                return code
-    if is_internal(e):
-        return Code.INTERNAL
-    match exit_code_of(e):
-        case exit_codes.REFUSED:
-            return Code.REFUSED
-        case exit_codes.DEVICE:
-            return Code.NOT_SETTLED if isinstance(e, StationError) else Code.LOST
-    return None
-
-
-_CODES: tuple[tuple[type[BaseException], Code], ...] = (
-    (asyncio.CancelledError, Code.STOPPED),
-    (KeyboardInterrupt, Code.STOPPED),
-    (DiskError, Code.DISK),
-    (TwoAnswer, Code.TWO_ANSWER),
-    (td.SecondAnswer, Code.TWO_ANSWER),
-    (WrongUnit, Code.WRONG_UNIT),
-    (SerialTwice, Code.SERIAL_TWICE),
-    (DeviceInUse, Code.IN_USE),
-    (Implausible, Code.IMPLAUSIBLE),
-    (NoPoses, Code.NO_POSES),
-    (td.DeviceAbsent, Code.ABSENT),
-    (td.DeviceSilent, Code.LOST),
-    (td.BusError, Code.LOST),
-)
-"""Error classes with their codes, in the order of the search."""

@@ -22,8 +22,8 @@ from triaxcald.outcome import (
     SUFFIX,
     Code,
     Ending,
+    History,
     Papers,
-    latest_of,
     outcome_document,
     registers_told,
 )
@@ -42,6 +42,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
+from triaxcald.schema.codes import Stage
 from triaxcald.software import software
 from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
@@ -72,7 +73,7 @@ class ProvisionRun:
     serial: str | None = None
     dry_run: bool = False
     force: str | None = None
-    ask: Callable[[str], None] | None = None
+    ask: Callable[[Stage, str], None] | None = None
     """Instructs the operator. If given, it asks for a power cycle when no restart
     proves the stored values."""
     clock_ns: Callable[[], int] = time.time_ns
@@ -195,7 +196,7 @@ class ProvisionRun:
             station=self.station.file.name,
             ended=self._now(),
             software=software(),
-            supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
+            supersedes=History.of(self.station.folder, p.identity.serial).latest if p else None,
             journal=str(self._open_journal) if self._open_journal else None,
             forced=self.force if self.warnings else None,
         )

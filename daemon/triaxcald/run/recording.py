@@ -25,6 +25,7 @@ from triaxcald.recording.writer import LOOK_S, RecordingWriter
 from triaxcald.run.reasons import reason_of, trace_of
 from triaxcald.run.session import Segments, UnitSession, new_writer, stamp
 from triaxcald.run.together import while_sound, whole_on_a_thread
+from triaxcald.schema.codes import Code
 from triaxcald.software import versions
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress, Recorded
@@ -209,7 +210,7 @@ class AtRecording(ABC):
         with await whole_on_a_thread(make) as writer:
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             if writer.warning is not None:
-                self._progress.stage(self.name, f"warning: {writer.warning}")
+                self._progress.note(self.name, f"warning: {writer.warning}")
             try:
                 # A disk may also fail while a unit is lost and sends nothing.
                 await while_sound(record(writer), partial(self._look_after, writer), LOOK_S)
@@ -226,11 +227,11 @@ class AtRecording(ABC):
         writer.check()
         is_behind, document = writer.is_behind, writer.keeps_for
         if is_behind and not self._was_behind:
-            self._progress.lost(self.name, text.DISK_IS_BEHIND)
+            self._progress.lost(self.name, Code.DISK, text.DISK_IS_BEHIND)
         elif self._was_behind and not is_behind:
-            self._progress.stage(self.name, text.DISK_KEEPS_UP)
+            self._progress.note(self.name, text.DISK_KEEPS_UP)
         if document is not None and document != self._kept_for:
-            self._progress.stage(self.name, text.nothing_deleted(document))
+            self._progress.note(self.name, text.nothing_deleted(document))
         self._was_behind, self._kept_for = is_behind, document
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
@@ -377,7 +378,7 @@ class BusRecording(AtRecording):
             self._path = self._path_of()
 
             async def record(writer: RecordingWriter) -> None:
-                self._progress.stage(self.name, "recording")
+                self._progress.note(self.name, "recording")
                 await self._listened.for_seconds(ReconnectingBus(listener, policy, is_lost), writer, seconds)
 
             make = partial(self._new_writer, self._path)
@@ -387,9 +388,9 @@ class BusRecording(AtRecording):
         self._state = State.RECORDING if trouble is None else State.WAITING
         self._trouble = trouble
         if trouble is None:
-            self._progress.stage(self.name, text.BUS_IS_BACK)
+            self._progress.note(self.name, text.BUS_IS_BACK)
         else:
-            self._progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
+            self._progress.lost(self.name, Code.LOST, text.waited_for(trouble, endless=policy.endless))
 
     def _new_writer(self, path: Path) -> RecordingWriter:
         """A writer with the station file as attachment. Raises RecordingError."""
@@ -482,7 +483,7 @@ class UnitRecording(AtRecording):
             self._path = self._path_of(identity)
 
             async def record(writer: RecordingWriter) -> None:
-                session.progress.stage(session.name, "recording")
+                session.progress.note(session.name, "recording")
                 confirmation = session.confirmation(device, identity, writer, self._recorded)
                 reconnecting = session.reconnecting(device, identity, policy, self._is_lost, confirmation)
                 try:

@@ -19,6 +19,8 @@ from triaxcald.provision.registers import Snapshot, take_snapshot
 from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.run.reasons import code_of
+from triaxcald.schema.codes import Code, Stage
 from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.config import Place, SerialsSeen, Station
@@ -76,7 +78,9 @@ class UnitSession:
 
     def waits(self, policy: RetryPolicy, trouble: Exception) -> None:
         """Report that the unit is lost and retried."""
-        self.progress.lost(self.name, text.waited_for(str(trouble), endless=policy.endless))
+        self.progress.lost(
+            self.name, code_of(trouble) or Code.ABSENT, text.waited_for(str(trouble), endless=policy.endless)
+        )
 
     def reconnecting(
         self,
@@ -97,9 +101,9 @@ class UnitSession:
         def tell(trouble: str | None) -> None:
             lost(trouble)
             if trouble is None:
-                self.progress.stage(self.name, text.IS_BACK)
+                self.progress.back(self.name)
             else:
-                self.progress.lost(self.name, text.waited_for(trouble, endless=policy.endless))
+                self.progress.lost(self.name, Code.LOST, text.waited_for(trouble, endless=policy.endless))
 
         # A unit with rare samples is silent only after the time of its profile.
         hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)
@@ -113,7 +117,7 @@ class UnitSession:
         its records."""
         told = self.profile.identity
         asked = partial(self._require_same, device, identity) if told.serial_register or told.expect else None
-        return Confirmation(asked, writer, recorded, lambda why: self.progress.stage(self.name, text.unidentified(why)))
+        return Confirmation(asked, writer, recorded, lambda why: self.progress.note(self.name, text.unidentified(why)))
 
     async def _require_same(self, device: td.Device, identity: IdentityRead) -> None:
         """Raises WrongUnit, TwoAnswer."""
@@ -123,7 +127,7 @@ class UnitSession:
         await identified(link, bundle, expected, where=self.place.address, device=device)
 
     async def identify(self, device: td.Device) -> IdentityRead:
-        self.progress.stage(self.name, "reading identity")
+        self.progress.stage(self.name, Stage.IDENTITY)
         link, where = RegisterLink(device, self.profile, name=self.place.device_name), self.place.address
         identity = await identified(link, self.place.bundle, self.place.unit.serial, where=where)
         self.serials.add(identity.serial, self.name, where)

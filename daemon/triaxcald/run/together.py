@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
 
 
-async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
+async def side_by_side(work: Iterable[Awaitable[T]]) -> list[T]:
     """Results of all, in order. Each cancellation is passed on to every one, and
     their ends are awaited."""
     units = [asyncio.ensure_future(one) for one in work]

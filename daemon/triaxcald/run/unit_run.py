@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -22,17 +22,21 @@ from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
 from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
-from triaxcald.files import write_text
+from triaxcald.files import write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
     ATTACHMENT,
+    CERTIFICATE,
     FORMAT,
+    REPORT,
+    RUN_RECORD,
+    SUFFIX,
     Code,
     Ending,
+    History,
     Papers,
     Verdict,
     digest_of,
-    latest_of,
     measured_in,
     outcome_document,
     registers_told,
@@ -45,18 +49,20 @@ from triaxcald.provision.registers import RegisterImage, leaves_open, require_re
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
+from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
-from triaxcald.run.session import UnitSession
+from triaxcald.run.session import UnitSession, stamp
 from triaxcald.run.together import side_by_side
 from triaxcald.run.write_back import WriteBack, corrected
-from triaxcald.software import software
+from triaxcald.schema.codes import Stage
+from triaxcald.software import new_run_id, software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.verification import Verification, fitted_attitudes
-
-CERTIFICATE, REPORT = "certificate.json", "report.html"
+from triaxcald.work import RECORD as WORK_RECORD
+from triaxcald.work import Attempt, Work
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,8 @@ class UnitRun(UnitSession):
 
     ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
     the active units of the station. ``rezero`` is a calibration whose biases alone
-    are renewed.
+    are renewed. ``work`` is what the unit is measured for, ``attempts`` the tray that
+    the run belongs to; by default it is a tray of its own. ``id`` is the id of the run.
     """
 
     def __init__(
@@ -108,10 +115,19 @@ class UnitRun(UnitSession):
         force: str | None = None,
         others: ActiveUnits | None = None,
         rezero: EarlierFile | None = None,
+        work: Work | None = None,
+        attempts: Attempts | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
         self.rezero = rezero
         self.others, self.force = others or ActiveUnits(1), force
+        self.id = new_run_id(clock_ns())
+        self.stopped_for: str | None = None
+        """Reason of a stop of this unit alone."""
+        self._attempts = attempts
+        self._attempt = Attempt(self.id, self._now(), work or Work(self.name, place.unit.serial))
+        self._attempt_file: AttemptFile | None = None
+        self._history = History()
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
         self._recording: Path | None = None
@@ -127,29 +143,40 @@ class UnitRun(UnitSession):
     async def run(self) -> Outcome:
         """Run the line. Raises nothing, not even when cancelled: the outcome has every
         error."""
+        if self._attempts is not None:
+            return await self._run(self._attempts)
+        tray = Attempts(self.station.folder, self.id, self.station.file.name)
+        try:
+            with tray.under_way():
+                return await self._run(tray)
+        except InputError as e:
+            return self._outcome(aborted(e, None))
+
+    async def _run(self, tray: Attempts) -> Outcome:
         ending: Ending | None = None
         try:
+            self._attempt_file = await asyncio.to_thread(tray.begin, self._attempt)
             policy = RetryPolicy(others=self.others)
             async with self.place.opened(policy, partial(self.waits, policy)) as device:
                 identity = await self.identify(device)
-                self._serial = identity.serial
+                await self._identified(identity)
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
                 path = self.recording_path(identity)
                 if self.rezero is not None:
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
                 await self._require_readings_before(device)
-                self._recording = path
-                with self.writer(self._recording, identity, ends_with=FORMAT, more=self._rezero_record) as writer:
+                await self._recorded_to(path)
+                with self.writer(path, identity, ends_with=FORMAT, more=self._records) as writer:
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
                     ending = await self._ending(device, identity, writer)
                     self._finalize(writer, ending)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             if self._document is None:  # a stored outcome is final
-                ending = aborted(e, self._provisioning)
+                ending = self._aborted(e)
                 self._artifacts = {}  # they report another ending
-                if self._recording is not None:
+                if self._recording is not None or ending.code is not None:
                     self._document = self._outcome_document(ending, None)
         assert ending is not None
         try:
@@ -158,7 +185,57 @@ class UnitRun(UnitSession):
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
             code = ending.code if ending.exit_code else Code.DISK
             ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
+        else:
+            if self._attempt_file is not None:
+                self._attempt_file.remove()
         return self._outcome(ending)
+
+    def stop(self, reason: str) -> None:
+        """Note the reason of a stop, which a cancellation of `run` has to follow."""
+        self.stopped_for = reason
+
+    def _aborted(self, e: BaseException) -> Ending:
+        ending = aborted(e, self._provisioning)
+        if self.stopped_for is not None and isinstance(e, asyncio.CancelledError):
+            return replace(ending, reason=f"stopped: {self.stopped_for}")
+        return ending
+
+    async def _identified(self, identity: IdentityRead) -> None:
+        """Note the serial number, and count the attempts at it. Raises DiskError."""
+        self._serial = identity.serial
+        work = self._attempt.work
+        self._history = await asyncio.to_thread(History.of, self.station.folder, identity.serial or work.serial)
+        attempt = None if (identity.serial or work.serial) is None else self._history.attempts + 1
+        self._attempt = replace(self._attempt, work=replace(work, attempt=attempt))
+
+    async def _recorded_to(self, path: Path) -> None:
+        """Note the recording before it begins. Raises DiskError."""
+        self._recording = path
+        self._attempt = replace(self._attempt, recording=path.name)
+        if self._attempt_file is not None:
+            self._attempt_file.attempt, self._attempt_file.serial = self._attempt, self._serial
+            await asyncio.to_thread(self._attempt_file.write)
+
+    def _settled(self, held: Held) -> None:
+        """Note the state of a settled device before its journal goes. Raises
+        DiskError."""
+        if self._attempt_file is not None:
+            self._attempt_file.held = held
+            self._attempt_file.write()
+
+    @property
+    def _records(self) -> dict[str, dict[str, str]]:
+        """Metadata of the recording: the run, its work, and the earlier calibration of
+        a rezero."""
+        attempt = self._attempt
+        return {
+            RUN_RECORD: {"run": attempt.run, "started": attempt.started},
+            WORK_RECORD: attempt.work.record(),
+            **self._rezero_record,
+        }
+
+    def _now(self) -> str:
+        return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
 
     async def _ending(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
@@ -166,7 +243,7 @@ class UnitRun(UnitSession):
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording still gets its outcome
             if self._confirmation is not None and self._confirmation.unconfirmed:
                 self._certified = None  # its records may be another unit's
-            ending = aborted(e, self._provisioning)
+            ending = self._aborted(e)
             with suppress(RecordingError):
                 writer.event("failed", {"error": ending.reason})
             return ending
@@ -222,11 +299,12 @@ class UnitRun(UnitSession):
             unit=self.name,
             serial=self._serial,
             station=self.station.file.name,
-            ended=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds"),
+            ended=self._now(),
             software=software(),
-            supersedes=latest_of(self.station.folder, self._serial),
+            supersedes=self._history.latest if self._serial is not None else None,
             journal=self._journal,
             forced=self.force if back and back.warnings else None,
+            attempt=self._attempt,
         )
 
     @property
@@ -246,6 +324,9 @@ class UnitRun(UnitSession):
         """Write the files beside the closed recording: certificate, report, and the
         outcome last."""
         if self._recording is None:
+            if self._document is not None:  # the attempt came to no recording
+                stem = f"{self.name}-{self._serial or 'unknown'}-{stamp(self.clock_ns())}"
+                self._paths[ATTACHMENT] = write_new(self.station.folder, stem, SUFFIX, to_text(self._document))
             return
         artifacts = dict(self._artifacts)
         if self._document is not None:
@@ -312,9 +393,10 @@ class UnitRun(UnitSession):
         policy = RetryPolicy(plan.comes_back_s, others=self.others)
         reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
+            self.progress.stage(self.name, Stage.POSES)
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
             await self._collect(reconnecting, writer, acquisition, td.READINGS, wanted)
-        self.progress.stage(self.name, "fitting")
+        self.progress.stage(self.name, Stage.FITTING)
         poses = acquisition.pipelines[td.READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
@@ -324,7 +406,7 @@ class UnitRun(UnitSession):
             self._write_back.verification if self._write_back else None,
             self.station.file.limits,
         )
-        self.progress.stage(self.name, "writing the report")
+        self.progress.stage(self.name, Stage.REPORT)
         artifacts = {
             REPORT: await asyncio.to_thread(self._report, certified, acquisition.pipelines[td.READINGS], ending)
         }
@@ -345,7 +427,7 @@ class UnitRun(UnitSession):
         acquisition: Collection,
     ) -> None:
         async def collect(check: Collection) -> None:
-            self.progress.stage(self.name, "verifying by physics")
+            self.progress.stage(self.name, Stage.CHECK_POSES)
             fitted = fitted_attitudes(acquisition.pipelines[td.READINGS], self.place.signs)
             plan = self.station.file.plan
             confirmation = self.confirmation(device, identity, writer, check)
@@ -360,15 +442,21 @@ class UnitRun(UnitSession):
             self.station,
             writer,
             collect,
-            ask=lambda what: self.progress.stage(self.name, what),
+            ask=self._ask,
+            run=self.id,
+            on_settled=self._settled,
             started=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="seconds"),
             force=self.force,
         )
         assert self._confirmation is not None
         async with self._confirmation.phase():  # the unit may have been silent when the poses ended
-            self.progress.stage(self.name, "writing the registers")
+            self.progress.stage(self.name, Stage.WRITING)
             examined = await self._write_back.examine(device, image, identity.serial, acquisition)
         await self._write_back.write(examined, acquisition)
+
+    def _ask(self, stage: Stage, what: str) -> None:
+        self.progress.stage(self.name, stage)
+        self.progress.note(self.name, what)
 
     def _certify(self, acquisition: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
@@ -414,7 +502,7 @@ class UnitRun(UnitSession):
         nothing."""
         async with self.place.opened() as device:
             identity = await self.identify(device)
-            self.progress.stage(self.name, "check poses")
+            self.progress.stage(self.name, Stage.CHECK_POSES)
             check = Collection(VERIFICATION, self.place.bundle, self.place.address)
             confirmation = self.confirmation(device, identity, None, check)
             there = self.reconnecting(device, identity, RetryPolicy(most_s=0.0), confirmation=confirmation)
@@ -428,41 +516,92 @@ class UnitRun(UnitSession):
         return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
 
 
-async def run_station(
-    station: Station,
-    progress: Progress,
-    *,
-    force: str | None = None,
-    rezero: Mapping[str, EarlierFile] | None = None,
-    ended: Callable[[Outcome], None] = lambda _: None,
-) -> list[Outcome]:
-    """Run all units of a station side by side.
+@dataclass
+class UnitHandle:
+    """A unit of a tray at work. ``slot`` is its name in the station file, ``run`` the
+    id of its run."""
+
+    slot: str
+    run: str
+    _unit: UnitRun
+    _task: asyncio.Task[Outcome] | None = None
+
+    def stop(self, reason: str) -> None:
+        """Stop this unit alone: it first puts its device in order. The others go on."""
+        self._unit.stop(reason)
+        if self._task is not None:
+            self._task.cancel()
+
+    @property
+    def ended(self) -> bool:
+        return self._task is not None and self._task.done()
+
+
+class TrayRun:
+    """The units of a station that are started together; awaiting it runs them all, and
+    gives their outcomes in the order of the station file.
 
     A failing unit does not stop the others; a lost unit is retried while others are
-    active. ``ended`` receives each outcome. ``rezero`` maps a unit to the
-    calibration whose biases alone are renewed.
-
-    Each cancellation is passed on to every unit. The units first put their devices
-    in order; the outcomes then have exit code 130.
+    active. Each cancellation is passed on to every unit. The units first put their
+    devices in order; the outcomes then have exit code 130. ``id`` is the id of the
+    tray, ``units`` the handles by slot.
     """
-    serials, others = SerialsSeen(), ActiveUnits(len(station.places))
-    runs = [
-        UnitRun(
-            station, place, progress,
-            serials=serials, force=force, others=others, rezero=(rezero or {}).get(place.unit.name),
-        )
-        for place in station.places
-    ]  # fmt: skip
 
-    async def work(run: UnitRun) -> Outcome:
+    def __init__(
+        self,
+        station: Station,
+        progress: Progress,
+        *,
+        force: str | None = None,
+        rezero: Mapping[str, EarlierFile] | None = None,
+        work: Mapping[str, Work] | None = None,
+        ended: Callable[[Outcome], None] = lambda _: None,
+        killed: Callable[[Killed], None] = lambda _: None,
+    ) -> None:
+        self.id = new_run_id()
+        self._station, self._ended, self._killed = station, ended, killed
+        self._serials, self._others = SerialsSeen(), ActiveUnits(len(station.places))
+        self._attempts = Attempts(station.folder, self.id, station.file.name)
+        self._runs = [
+            UnitRun(
+                station, place, progress,
+                serials=self._serials, force=force, others=self._others,
+                rezero=(rezero or {}).get(place.unit.name), work=(work or {}).get(place.unit.name),
+                attempts=self._attempts,
+            )
+            for place in station.places
+        ]  # fmt: skip
+        self.units = {run.name: UnitHandle(run.name, run.id, run) for run in self._runs}
+
+    def __await__(self) -> Generator[Any, None, list[Outcome]]:
+        return self._all().__await__()
+
+    async def _all(self) -> list[Outcome]:
+        """Raises InputError if the folder cannot be used."""
+        for killed in await asyncio.to_thread(settle_killed, self._station):
+            self._killed(killed)
+        with self._attempts.under_way(), ExitStack() as stack:
+            for run in self._runs:
+                stack.enter_context(at_abort(run.abort_notice))
+            for run in self._runs:
+                handle = self.units[run.name]
+                handle._task = asyncio.ensure_future(self._one(run))
+                if run.stopped_for is not None:  # before it began
+                    handle._task.cancel()
+            return await side_by_side(handle._task for handle in self.units.values() if handle._task is not None)
+
+    async def _one(self, run: UnitRun) -> Outcome:
         try:
             outcome = await run.run()
         finally:
-            others.leave()
-        ended(outcome)
+            self._others.leave()
+        self._ended(outcome)
         return outcome
 
-    with ExitStack() as stack:
-        for run in runs:
-            stack.enter_context(at_abort(run.abort_notice))
-        return await side_by_side(map(work, runs))
+
+def run_station(station: Station, progress: Progress, **settings: Any) -> TrayRun:
+    """The units of a station, to be awaited; ``settings`` as in `TrayRun`: ``ended``
+    receives each outcome, ``killed`` each attempt that an earlier process left,
+    ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
+    maps it to what it is measured for."""
+    return TrayRun(station, progress, **settings)

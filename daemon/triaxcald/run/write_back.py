@@ -28,8 +28,10 @@ from triaxcald.provision.registers import (
     is_blank,
     require_readings_before,
 )
-from triaxcald.provision.state import DeviceState
+from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.schema.codes import Stage
+from triaxcald.software import new_run_id
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station
 from triaxcald.station.power import power_cycle_asked
@@ -58,7 +60,8 @@ class WriteBack:
     """Writes a calibration into the device and verifies it.
 
     ``collect`` collects check poses, ``ask`` instructs the operator; ``force`` is
-    the reason to continue in spite of `warnings`. ``verdict`` is that on the
+    the reason to continue in spite of `warnings`; ``run`` is the id of the run, and
+    ``on_settled`` as in `Provisioning`. ``verdict`` is that on the
     device's own output, None before it is judged.
     """
 
@@ -66,9 +69,11 @@ class WriteBack:
     station: Station
     writer: RecordingWriter
     collect: Callable[[Collection], Awaitable[None]]
-    ask: Callable[[str], None]
+    ask: Callable[[Stage, str], None]
     started: str
     force: str | None = None
+    run: str = field(default_factory=new_run_id)
+    on_settled: Callable[[Held], None] = lambda _: None
     verification: tc.interchange.Document | None = field(default=None, init=False)
     verdict: str | None = field(default=None, init=False)
     warnings: Sequence[SanityWarning] = field(default=(), init=False)
@@ -90,6 +95,8 @@ class WriteBack:
             expected_serial=serial,
             where=self.place.address,
             started=self.started,
+            run=self.run,
+            on_settled=self.on_settled,
             power_cycle=asked if self.station.file.provisioning.power_cycle else None,
         )
         await p.examine()

@@ -17,6 +17,7 @@ from triaxcald.decoded import DecodedStream
 from triaxcald.errors import NoPoses, RecordingError, TwoAnswer
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.schema.codes import Code, Stage
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
@@ -41,11 +42,22 @@ guided by them: the cost of a batch hardly depends on its size."""
 
 
 class Progress(Protocol):
-    """Display of the progress for the operator."""
+    """Receives the progress of the units of a station, as values."""
 
-    def stage(self, unit: str, text: str) -> None: ...
-    def lost(self, unit: str, trouble: str) -> None: ...
-    def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
+    def stage(self, unit: str, stage: Stage) -> None:
+        """A stage of the work on the unit begins."""
+
+    def note(self, unit: str, text: str) -> None:
+        """A remark for people alone."""
+
+    def lost(self, unit: str, code: Code, reason: str) -> None:
+        """The unit is lost, and waited for; ``reason`` is one line."""
+
+    def back(self, unit: str) -> None:
+        """A lost unit is back."""
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        """State of a pose acquisition, several times a second."""
 
 
 @dataclass

@@ -17,9 +17,34 @@ poses are to each other."""
 
 
 @dataclass(frozen=True)
+class NextPose:
+    """The pose to take next: the ``label`` in the plan and the direction of up in the
+    unit's axes, of length 1. ``once_more``: it was taken before, and is wanted
+    again."""
+
+    label: str
+    vector: tuple[float, float, float]
+    once_more: bool = False
+
+    def __str__(self) -> str:
+        """The axes that point up; the components of a direction that only a number
+        names."""
+        if self.label.startswith(("+", "-")):
+            up = f"{self.label} up"
+        else:
+            x, y, z = self.vector
+            up = f"{self.label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+        return f"{up} once more: the first pose again shows drift" if self.once_more else up
+
+
+@dataclass(frozen=True)
 class Guide:
     """State of a pose acquisition: ``found`` of ``wanted`` distinct poses; ``held_s``
-    is the present time of stillness (0 during a motion).
+    is the present time of stillness (0 during a motion), of ``hold_s`` that a pose
+    needs.
+
+    ``next`` is the next pose; None if the acquisition is complete, or if any pose not
+    taken yet will do. ``too_short``: the present pose has to be held longer.
 
     ``missing`` are the labels of the uncovered poses of the plan, in its order.
     ``repeat_due``: the first pose is wanted once more, after all others.
@@ -30,7 +55,9 @@ class Guide:
     found: int
     wanted: int
     held_s: float
-    hint: str
+    hold_s: float
+    next: NextPose | None = None
+    too_short: bool = False
     missing: tuple[str, ...] = ()
     repeat_due: bool = False
     counted_s: tuple[float, ...] = ()
@@ -40,6 +67,15 @@ class Guide:
     @property
     def complete(self) -> bool:
         return (self.found >= self.wanted or self.only_near) and not self.repeat_due
+
+    @property
+    def text(self) -> str:
+        """The instruction to the operator, in words."""
+        if self.complete:
+            return "done"
+        if self.too_short:
+            return f"hold still, {self.held_s:.1f} of {self.hold_s:.1f} s"
+        return "turn the unit to a pose not taken yet" if self.next is None else f"next: {self.next}"
 
 
 def guide(
@@ -99,18 +135,14 @@ def guide(
         )
     missing = _uncovered(targets, held) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
-    if (found >= wanted or only_near) and not due:
-        hint = "done"
-    elif 0 < still_s < hold_s and not enough[-1]:
-        hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
-    elif due:
-        hint = f"next: {_nearest(targets, distinct[0])}once more: the first pose again shows drift"
-    elif missing:
-        hint = f"next: {_said(missing[0], targets)}"
-    else:
-        hint = "turn the unit to a pose not taken yet"
+    following = None
+    if due:
+        following = _again(targets, distinct[0])
+    elif missing and not only_near:
+        following = _pose_of(*next(target for target in targets if target[0] == missing[0]))
+    too_short = 0 < still_s < hold_s and not enough[-1]
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
-    return Guide(found, wanted, still_s, hint, missing, due, middles, only_near)
+    return Guide(found, wanted, still_s, hold_s, following, too_short, missing, due, middles, only_near)
 
 
 def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
@@ -127,20 +159,18 @@ def _uncovered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Float
     return tuple(label for i, (label, _) in enumerate(targets) if i not in covered)
 
 
-def _nearest(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> str:
+def _pose_of(label: str, v: tc.Floats, *, once_more: bool = False) -> NextPose:
+    x, y, z = v.tolist()
+    return NextPose(label, (x, y, z), once_more)
+
+
+def _again(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> NextPose:
+    """The direction of the plan nearest to the pose ``v``; without a plan the pose
+    itself."""
     if not targets:
-        return ""
-    label, _ = max(targets, key=lambda target: float(target[1] @ v))
-    return f"{_said(label, targets)} "
-
-
-def _said(label: str, targets: Sequence[tc.planning.Direction]) -> str:
-    """The axes that point up; for a direction that only a number names, its
-    components."""
-    if label.startswith(("+", "-")):
-        return f"{label} up"
-    x, y, z = next(v for name, v in targets if name == label)
-    return f"{label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+        return _pose_of("first", v, once_more=True)
+    label, direction = max(targets, key=lambda target: float(target[1] @ v))
+    return _pose_of(label, direction, once_more=True)
 
 
 def ups(poses: Sequence[tc.StillSpan], nominal: Sequence[float] | None) -> tc.Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcald.cli.console import Bars
+from triaxcald.cli.bars import Bars
 from triaxcald.station.guidance import Guide
 
 

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from triaxcald.abort import tell
-from triaxcald.cli.console import Bars, say, show, table
+from triaxcald.cli.bars import Bars
+from triaxcald.cli.console import say, show, table
 from triaxcald.printable import printable, printable_json
 from triaxcald.recording import schema
 from triaxcald.recording.reader import Recording

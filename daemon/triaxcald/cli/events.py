@@ -1,0 +1,142 @@
+"""The events of a run on standard output, one JSON object a line
+(`triaxcal.event/1`)."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, TextIO
+
+from triaxcald.printable import printable_json
+from triaxcald.schema.codes import Stage
+
+if TYPE_CHECKING:
+    from triaxcald.recording.schema import Phase
+    from triaxcald.run.unit_run import Outcome
+    from triaxcald.schema.codes import Code
+    from triaxcald.station.collection import Progress
+    from triaxcald.station.guidance import Guide
+
+DRAIN_S = 5.0
+"""Longest wait at the end for a reader that does not read."""
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+class EventLines:
+    """Writes each event at once, on a thread of its own: a reader that is slow or gone
+    stops no measurement. ``runs`` maps the slots to the ids of their runs."""
+
+    def __init__(self, out: TextIO, tray: str, runs: Mapping[str, str], now: Callable[[], datetime] = _now) -> None:
+        self._out, self._tray, self._runs, self._now = out, tray, runs, now
+        self._seq = 0
+        self._latest: dict[str, object] = {}
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="events", daemon=True)
+
+    def __enter__(self) -> EventLines:
+        self._thread.start()
+        self._say("tray", None, state="started")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._say("tray", None, state="ended")
+        self._lines.put(None)
+        self._thread.join(DRAIN_S)
+
+    # Progress.
+
+    def stage(self, unit: str, stage: Stage) -> None:
+        self._latest.pop(unit, None)
+        self._say("stage", unit, stage=stage.value)
+
+    def note(self, unit: str, text: str) -> None:
+        """For people alone."""
+
+    def lost(self, unit: str, code: Code, reason: str) -> None:
+        self._say("lost", unit, code=code.value, reason=reason)
+
+    def back(self, unit: str) -> None:
+        self._say("back", unit)
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        following = guide.next
+        event = {
+            "found": guide.found,
+            "wanted": guide.wanted,
+            "next": None
+            if following is None
+            else {
+                "label": following.label,
+                "vector": [round(v, 6) for v in following.vector],
+                "once_more": following.once_more,
+            },
+        }
+        if self._latest.get(unit) != event:  # it comes several times a second
+            self._latest[unit] = event
+            self._say("poses", unit, **event)
+
+    def ended(self, outcome: Outcome) -> None:
+        self._say("ended", outcome.unit, outcome=outcome.document)
+
+    def _say(self, event: str, unit: str | None, **more: Any) -> None:
+        self._seq += 1
+        line = {
+            "format": "triaxcal.event/1",
+            "seq": self._seq,
+            "time": self._now().isoformat(timespec="milliseconds"),
+            "run": None if unit is None else self._runs.get(unit),
+            "tray": self._tray,
+            "unit": unit,
+            "event": event,
+            **more,
+        }
+        self._lines.put(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)))
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            try:
+                self._out.write(line + "\n")
+                self._out.flush()
+            except (OSError, ValueError):  # nobody reads any more; the work goes on
+                with suppress(OSError):
+                    self._drop()
+                return
+
+    def _drop(self) -> None:
+        """Later lines go nowhere."""
+        while self._lines.get() is not None:
+            pass
+
+
+class Several:
+    """Passes the progress on to several receivers."""
+
+    def __init__(self, receivers: Sequence[Progress]) -> None:
+        self._receivers = receivers
+
+    def stage(self, unit: str, stage: Stage) -> None:
+        for receiver in self._receivers:
+            receiver.stage(unit, stage)
+
+    def note(self, unit: str, text: str) -> None:
+        for receiver in self._receivers:
+            receiver.note(unit, text)
+
+    def lost(self, unit: str, code: Code, reason: str) -> None:
+        for receiver in self._receivers:
+            receiver.lost(unit, code, reason)
+
+    def back(self, unit: str) -> None:
+        for receiver in self._receivers:
+            receiver.back(unit)
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        for receiver in self._receivers:
+            receiver.poses(unit, phase, guide)

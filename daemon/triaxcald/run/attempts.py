@@ -1,0 +1,338 @@
+"""Every attempt at a unit leaves an outcome, also that of a killed process.
+
+A file in the station's folder stands for each attempt that is under way. It says what
+an outcome needs, and is removed once the outcome is on the disk. The process holds a
+lock on a file of its tray. The next start in the folder takes each attempt whose tray
+nobody holds for one that was killed, repairs its recording and writes its outcome.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import triaxcal as tc
+from triaxcald import text
+from triaxcald.documents import to_text
+from triaxcald.errors import DiskError, InputError, RecordingError
+from triaxcald.files import synchronise, write_durably, write_new, write_text
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, Code, Ending, History, Papers, outcome_document
+from triaxcald.provision.journal import open_journal
+from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.recover import Sealed, recover
+from triaxcald.recording.survey import survey
+from triaxcald.software import software
+from triaxcald.station.config import Station
+from triaxcald.work import Attempt, Work
+
+try:
+    import fcntl
+except ImportError:
+    fcntl = None  # type: ignore[assignment]
+
+FOLDER: Final = "running"
+FORMAT: Final = "triaxcal.attempt/1"
+PAPERS: Final = (CERTIFICATE, REPORT)
+"""Attachments that state an ending, which a killed run did not reach."""
+
+
+@dataclass
+class AttemptFile:
+    """The file of an attempt under way. ``serial`` is the number that the unit itself
+    has told, ``held`` the state of its device once a provisioning is settled."""
+
+    path: Path
+    tray: str
+    station: str
+    attempt: Attempt
+    serial: str | None = None
+    held: Held | None = None
+
+    def write(self) -> None:
+        """Write the file, and return once it is on the disk. Raises DiskError."""
+        held = self.held
+        document = {
+            "format": FORMAT,
+            "tray": self.tray,
+            "station": self.station,
+            "run": self.attempt.run,
+            "started": self.attempt.started,
+            "recording": self.attempt.recording,
+            "work": self.attempt.work.document(),
+            "serial": self.serial,
+            "held": None
+            if held is None
+            else {"state": held.state, "evidence": held.evidence, "observed": held.observations},
+        }
+        try:
+            write_durably(self.path, json.dumps(document, indent=2) + "\n")
+        except OSError as e:
+            raise DiskError(f"{self.path}: cannot be written: {e.strerror}") from e
+
+    def remove(self) -> None:
+        """Remove the file, since the outcome is on the disk. Raises nothing: the next
+        start finds the outcome and removes it."""
+        with suppress(OSError):
+            self.path.unlink(missing_ok=True)
+
+    @staticmethod
+    def read(path: Path) -> AttemptFile | None:
+        """None where the file is none of ours, or gone."""
+        try:
+            held = json.loads(path.read_bytes())
+            state = held["held"]
+            return AttemptFile(
+                path,
+                str(held["tray"]),
+                str(held["station"]),
+                Attempt(
+                    str(held["run"]),
+                    str(held["started"]),
+                    Work(**held["work"]),
+                    held["recording"] if held["recording"] is None else Path(held["recording"]).name,
+                ),
+                held["serial"],
+                None
+                if state is None
+                else Held(
+                    DeviceState(state["state"]), Evidence(state["evidence"]), set(map(Observation, state["observed"]))
+                ),
+            )
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            return None
+
+
+@dataclass
+class Attempts:
+    """Attempts of one tray in a station's folder: of all units that are started
+    together."""
+
+    folder: Path
+    tray: str
+    station: str
+    _lock: int | None = field(default=None, init=False)
+
+    @property
+    def _within(self) -> Path:
+        return self.folder / FOLDER
+
+    @contextmanager
+    def under_way(self) -> Iterator[None]:
+        """Hold the tray's lock. Raises InputError if the folder cannot be made."""
+        path = self._within / f"{self.tray}.lock"
+        try:
+            self._within.mkdir(parents=True, exist_ok=True)
+            synchronise(self.folder)
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            if fcntl is not None:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as e:
+            raise InputError(f"{self.folder}: no folder for recordings: {e.strerror}") from e
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                if not any(self._of_tray()):
+                    path.unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = None
+
+    def begin(self, attempt: Attempt) -> AttemptFile:
+        """The file of an attempt that begins, on the disk. Raises DiskError."""
+        file = AttemptFile(self._within / f"{attempt.run}.json", self.tray, self.station, attempt)
+        file.write()
+        return file
+
+    def _of_tray(self) -> Iterator[AttemptFile]:
+        for path in self._within.glob("*.json"):
+            file = AttemptFile.read(path)
+            if file is not None and file.tray == self.tray:
+                yield file
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What was made of a killed attempt: its outcome, the path of the outcome, and a
+    line for people."""
+
+    document: Mapping[str, Any]
+    path: Path
+    line: str
+
+
+def settle_killed(station: Station) -> list[Killed]:
+    """Write the outcomes of all killed attempts in the station's folder. Raises
+    InputError, DiskError."""
+    within = station.folder / FOLDER
+    trays: dict[str, list[AttemptFile]] = {}
+    for path in sorted(within.glob("*.json")):
+        file = AttemptFile.read(path)
+        if file is not None:
+            trays.setdefault(file.tray, []).append(file)
+    found = []
+    for tray, files in trays.items():
+        with _abandoned(within / f"{tray}.lock") as abandoned:
+            if abandoned:
+                found += [killed for file in files if file.path.exists() and (killed := _settle(station, file))]
+    return found
+
+
+@contextmanager
+def _abandoned(path: Path) -> Iterator[bool]:
+    """Whether no process holds the lock of the tray; it is held meanwhile, and its
+    file removed at the end."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                yield False
+                return
+        yield True
+        path.unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def _settle(station: Station, file: AttemptFile) -> Killed | None:
+    """The outcome of a killed attempt; None if the attempt has one already."""
+    name = file.attempt.recording
+    recording = None if name is None else station.folder / name
+    if recording is not None and not recording.exists():
+        recording = None
+    if _has_outcome(station.folder, file, recording):
+        file.remove()
+        return None
+    attempt = replace(file.attempt, recording=None if recording is None else recording.name)
+    document = _document(station, file, attempt, None)
+    if recording is None:
+        stem = f"{attempt.work.slot}-{file.serial or 'unknown'}-{_stamp(attempt.started)}"
+        path = write_new(station.folder, stem, SUFFIX, to_text(document))
+    else:
+        try:
+            document = _mended(station, file, attempt, recording)
+        except (RecordingError, tc.Refused):  # nothing in it can be read: it stays as it is
+            document = _document(station, file, attempt, None)
+        path = write_text(recording.with_suffix(f".{ATTACHMENT}"), to_text(document))
+    file.remove()
+    return Killed(document, path, text.killed(attempt.work.slot, attempt.started, path, document, station.path))
+
+
+def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> bool:
+    """Whether the killed process had stored its outcome. The documents beside a
+    finished recording are completed from its attachments."""
+    if recording is None:
+        slot = file.attempt.work.slot
+        return any(_run_in(path) == file.attempt.run for path in folder.glob(f"{slot}-*{SUFFIX}"))
+    try:
+        with Recording.open(recording) as finished:
+            held = {name: finished.attachments[name] for name in (*PAPERS, ATTACHMENT) if name in finished.attachments}
+    except (RecordingError, InputError):
+        return False
+    if ATTACHMENT not in held:
+        return False
+    for name, data in held.items():
+        path = recording.with_suffix(f".{name}")
+        if not path.exists():
+            write_text(path, data.decode())
+    return True
+
+
+def _run_in(path: Path) -> str | None:
+    try:
+        found = json.loads(path.read_bytes())
+        return str(found["run"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+
+
+def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Path) -> dict[str, Any]:
+    """Mend the recording, with the outcome as its last attachment. Raises
+    RecordingError, Refused, InputError."""
+    draft, mended = (recording.with_suffix(f".{kind}.mcap") for kind in ("draft", "mended"))
+    for path in (draft, mended):
+        path.unlink(missing_ok=True)  # of a start that was killed itself
+    try:
+        # Once without the outcome, which lists what is in the file before it.
+        recover(recording, draft, without=PAPERS)
+        with Recording.open(draft) as found:
+            contents = survey(found, ATTACHMENT).inventory.document()
+        document = _document(station, file, attempt, contents)
+        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), to_text(document).encode())
+        recovery = recover(recording, mended, without=PAPERS, sealed=sealed)
+        if not recovery.lossless:  # what could not be read may be read by somebody else
+            os.replace(recording, recording.with_suffix(".mcap.damaged"))
+        os.replace(mended, recording)
+        synchronise(recording.parent)
+    except OSError as e:
+        raise DiskError(f"{recording}: cannot be mended: {e.strerror}") from e
+    finally:
+        for path in (draft, mended):
+            path.unlink(missing_ok=True)
+    return document
+
+
+def _document(
+    station: Station, file: AttemptFile, attempt: Attempt, contents: tc.interchange.Document | None
+) -> dict[str, Any]:
+    held, journal = _held(station, file)
+    return dict(
+        outcome_document(
+            Ending(Code.KILLED.verdict, text.KILLED, -1, Code.KILLED),
+            held,
+            Papers(limits=station.file.limits.model_dump(), contents=contents),
+            unit=attempt.work.slot,
+            serial=file.serial,
+            station=file.station,
+            ended=_time(_ended_ns(file)),
+            software=software(),
+            supersedes=History.of(station.folder, file.serial).latest,
+            journal=None if journal is None else str(journal),
+            attempt=attempt,
+        )
+    )
+
+
+def _held(station: Station, file: AttemptFile) -> tuple[Held, Path | None]:
+    """State of the device, and the journal that is needed to settle it.
+
+    The journal is on the disk before the first write. It is removed after the file of
+    the attempt has the state of the settled device.
+    """
+    place = next((p for p in station.places if p.unit.name == file.attempt.work.slot), None)
+    journal = None
+    if place is not None:
+        serial = file.serial or place.unit.serial
+        journal = open_journal(station.folder, place.bundle.profile, file.attempt.work.slot, serial)
+    if journal is not None:
+        return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER), journal
+    return file.held or Held(), None
+
+
+def _ended_ns(file: AttemptFile) -> int:
+    """The last sign of life: of the attempt's file or of its recording."""
+    times = [file.path.stat().st_mtime_ns]
+    if file.attempt.recording is not None:
+        with suppress(OSError):
+            times.append((file.path.parent.parent / file.attempt.recording).stat().st_mtime_ns)
+    return max(times)
+
+
+def _time(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+
+
+def _stamp(started: str) -> str:
+    """For the name of a file, of a time in ISO 8601."""
+    try:
+        return datetime.fromisoformat(started).astimezone(UTC).strftime("%Y%m%dT%H%M%SZ")
+    except ValueError:
+        return "killed"
