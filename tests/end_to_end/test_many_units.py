@@ -14,9 +14,11 @@ from triaxcal_drivers.modbus.protocol import SerialLine
 from triaxcal_drivers.modbus.stack import serve_serial
 from triaxcald.audit import audit
 from triaxcald.run.unit_run import Outcome, run_station
+from triaxcald.schema.codes import Stage
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.modbus_unit import ModbusMap, pty_pair
 from triaxcald.station.config import check_lines, load_station
+from triaxcald.text import IS_BACK, STAGES
 
 pytestmark = pytest.mark.slow
 
@@ -31,10 +33,16 @@ class Told:
     def __init__(self) -> None:
         self.said: list[tuple[str, str]] = []
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, STAGES[stage])
+
+    def back(self, unit: str) -> None:
+        self.note(unit, IS_BACK)
+
+    def note(self, unit: str, text: str) -> None:
         self.said.append((unit, text))
 
-    def lost(self, unit: str, trouble: str) -> None:
+    def lost(self, unit: str, code: object, trouble: str) -> None:
         self.said.append((unit, f"lost: {trouble}"))
 
     def poses(self, unit: str, phase: str, guide: Any) -> None:

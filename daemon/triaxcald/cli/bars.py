@@ -114,8 +114,8 @@ class Bars:
         if self._live:
             with suppress(OSError):
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)
-        else:
-            say(line)
+        else:  # an error line names the program, as in other commands
+            say(line if outcome.error is None else f"triaxcal: {line}")
 
     def _show(self, unit: str, **values: Any) -> None:
         with suppress(OSError):  # the terminal has gone; the work goes on
@@ -133,6 +133,6 @@ def verdict_line(outcome: Outcome) -> str:
     word = VERDICTS[outcome.document["verdict"]]
     if outcome.error is not None:
         poses = f"; add the poses {', '.join(outcome.wanted)}" if outcome.wanted else ""
-        return f"{word:<8} {outcome.error}{poses}"
+        return f"{word} {outcome.error}{poses}"
     serial = outcome.document["serial"]
     return f"{word:<8} unit {outcome.unit}{f', serial {serial}' if serial else ''}: {outcome.document['reason']}"

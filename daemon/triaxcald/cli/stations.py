@@ -65,7 +65,8 @@ def run_command(a: argparse.Namespace) -> int:
             emit(Run(format="triaxcal.run/1", units=[_unit(o) for o in outcomes]).document())
         elif not a.events:
             for o in outcomes:
-                show_summary(o)
+                if o.error is None:
+                    show_summary(o)
     return worst(outcomes)
 
 

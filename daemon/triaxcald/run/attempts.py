@@ -128,9 +128,8 @@ class Attempts:
         """Hold the tray's lock. Raises InputError if the folder cannot be made."""
         path = self._within / f"{self.tray}.lock"
         try:
-            self._within.mkdir(parents=True, exist_ok=True)
+            self._lock = _opened(path)
             synchronise(self.folder)
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             if fcntl is not None:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as e:
@@ -141,6 +140,7 @@ class Attempts:
             with suppress(OSError):
                 if not any(self._of_tray()):
                     path.unlink(missing_ok=True)
+                self._within.rmdir()  # which fails while another tray is in it
             os.close(self._lock)
             self._lock = None
 
@@ -155,6 +155,14 @@ class Attempts:
             file = AttemptFile.read(path)
             if file is not None and file.tray == self.tray:
                 yield file
+
+
+def _opened(path: Path) -> int:
+    """A descriptor of the file, which is made with its folder. Raises OSError."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # another tray has ended, and removed the empty folder
+            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
 
 @dataclass(frozen=True)
@@ -188,7 +196,7 @@ def settle_killed(station: Station) -> list[Killed]:
 def _abandoned(path: Path) -> Iterator[bool]:
     """Whether no process holds the lock of the tray; it is held meanwhile, and its
     file removed at the end."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = _opened(path)
     try:
         if fcntl is not None:
             try:
@@ -198,6 +206,8 @@ def _abandoned(path: Path) -> Iterator[bool]:
                 return
         yield True
         path.unlink(missing_ok=True)
+        with suppress(OSError):
+            path.parent.rmdir()
     finally:
         os.close(descriptor)
 

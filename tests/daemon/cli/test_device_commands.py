@@ -183,7 +183,10 @@ def _each_is_absent(workshop: Any, triaxcal: Run, station: Path, *words: str) ->
         ["provision", cal, station],
     ):
         triaxcal(*command).failed(4, *words)
-    assert sorted(workshop.folder.iterdir()) == before
+    (outcome,) = set(workshop.folder.iterdir()) - set(before)  # of the attempt that `run` was
+    held = json.loads(outcome.read_bytes())
+    assert (held["verdict"], held["code"], held["exit_code"]) == ("aborted", "absent", 4)
+    assert (held["device_state"], held["recording"], held["contents"]) == ("untouched", None, None)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import json
 from datetime import UTC, datetime
 
 from triaxcald.cli.record import JsonLines
+from triaxcald.schema.codes import Code
 
 NOW = datetime(2026, 3, 1, 12, 0, 0, 250_000, UTC)
 
@@ -14,8 +15,8 @@ NOW = datetime(2026, 3, 1, 12, 0, 0, 250_000, UTC)
 def test_each_line_is_an_object_with_time_level_and_event() -> None:
     out = io.StringIO()
     lines = JsonLines(out, lambda: NOW)
-    lines.stage("unit0", "recording")
-    lines.lost("unit0", "nothing answers\nat node 5")
+    lines.note("unit0", "recording")
+    lines.lost("unit0", Code.ABSENT, "nothing answers\nat node 5")
     lines.say("error", "ended", unit="unit0", lost=3)
     assert [json.loads(line) for line in out.getvalue().splitlines()] == [
         {"time": "2026-03-01T12:00:00.250+00:00", "level": "info", "event": "stage", "unit": "unit0",
@@ -29,4 +30,4 @@ def test_each_line_is_an_object_with_time_level_and_event() -> None:
 def test_nobody_who_reads_is_no_failure() -> None:
     out = io.StringIO()
     out.close()
-    JsonLines(out).stage("unit0", "recording")
+    JsonLines(out).note("unit0", "recording")

@@ -5,23 +5,24 @@ from __future__ import annotations
 import pytest
 
 from triaxcald.cli.bars import Bars
-from triaxcald.station.guidance import Guide
+from triaxcald.station.guidance import Guide, NextPose
 
 
 def test_a_log_gets_one_line_for_each_pose(capsys: pytest.CaptureFixture[str]) -> None:
-    hints = [
-        (0, "next: +X up"),
-        (0, "hold still, 0.5 of 3.0 s"),
-        (0, "hold still, 1.0 of 3.0 s"),
-        (1, "next: -Y+Z up"),
-        (1, "next: -Y+Z up"),
-        (1, "hold still, 0.5 of 3.0 s"),
-        (1, "next: -Y+Z up"),
-        (2, "done"),
+    first, second = NextPose("+X", (1.0, 0.0, 0.0)), NextPose("-Y+Z", (0.0, -0.7, 0.7))
+    guides = [
+        Guide(0, 2, 0.0, 3.0, first),
+        Guide(0, 2, 0.5, 3.0, first, too_short=True),
+        Guide(0, 2, 1.0, 3.0, first, too_short=True),
+        Guide(1, 2, 0.0, 3.0, second),
+        Guide(1, 2, 0.0, 3.0, second),
+        Guide(1, 2, 0.5, 3.0, second, too_short=True),
+        Guide(1, 2, 0.0, 3.0, second),
+        Guide(2, 2, 0.0, 3.0),
     ]
     with Bars() as bars:
-        for found, hint in hints:
-            bars.poses("can", "calibration", Guide(found, 2, 0.0, hint))
+        for guide in guides:
+            bars.poses("can", "calibration", guide)
     assert capsys.readouterr().err.splitlines() == [
         "can: poses: 0 of 2 directions; next: +X up",
         "can: poses: 1 of 2 directions; next: -Y+Z up",

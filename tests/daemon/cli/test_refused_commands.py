@@ -208,7 +208,7 @@ def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any,
     )
     os.close(writing)
     assert done.returncode == 4
-    assert done.stderr.splitlines()[-1].startswith("triaxcal: unit unit0: cannot connect to ")
+    assert done.stderr.splitlines()[-1].startswith("triaxcal: STOPPED unit unit0: cannot connect to ")
 
 
 @pytest.mark.parametrize(("found", "kept", "code"), [(True, True, 0), (True, False, 1), (False, True, 1)])
@@ -221,7 +221,7 @@ def test_a_demo_ends_well_only_if_the_effect_was_found_and_stays_gone_after_a_po
             ending, Held(), Papers(), unit=unit, serial=None, station="demo", ended=at, software={}, supersedes=None
         )
 
-    async def done(folder: Path, seed: int, progress: Any) -> list[DemoUnit]:
+    async def done(folder: Path, seed: int, progress: Any, ended: Any) -> list[DemoUnit]:
         well = DemoUnit({}, Outcome("can", 0, document("can"), Held()), None, True, True)
         return [well, DemoUnit({}, Outcome("modbus", 0, document("modbus"), Held()), None, found, kept)]
 

@@ -20,6 +20,7 @@ from triaxcald.printable import printable, printable_json
 from triaxcald.recording import schema
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.schema.codes import Code
 
 Run = Callable[..., Any]
 GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
@@ -71,8 +72,8 @@ def test_every_way_to_the_terminal_makes_it_printable(capfd: pytest.CaptureFixtu
     tell(HOSTILE)
     table(HOSTILE, ["", HOSTILE], [[HOSTILE, (HOSTILE, HOSTILE)]])
     with Bars() as bars:
-        bars.stage(HOSTILE, HOSTILE)
-        bars.lost(HOSTILE, HOSTILE)
+        bars.note(HOSTILE, HOSTILE)
+        bars.lost(HOSTILE, Code.LOST, HOSTILE)
     out, err = capfd.readouterr()
     assert_clean(out, err)
     assert (out.count("owned"), err.count("owned")) >= (4, 4)

@@ -25,9 +25,11 @@ from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
 from triaxcald.run.unit_run import run_station
+from triaxcald.schema.codes import Stage
 from triaxcald.station import output_check as confirmation
 from triaxcald.station.config import load_station
 from triaxcald.station.reconnect import RetryPolicy
+from triaxcald.text import IS_BACK, STAGES
 
 OURS_V, THEIRS_V = -2.4, -2.1
 OTHER_SERIAL = 888
@@ -217,10 +219,16 @@ class Changing:
     def __init__(self, unit: str, moment: Callable[[str, str, int], bool], change: Callable[[], None]) -> None:
         self._unit, self._moment, self._change = unit, moment, change
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, STAGES[stage])
+
+    def back(self, unit: str) -> None:
+        self.note(unit, IS_BACK)
+
+    def note(self, unit: str, text: str) -> None:
         self._at(unit, text, 0)
 
-    def lost(self, unit: str, trouble: str) -> None: ...
+    def lost(self, unit: str, code: object, trouble: str) -> None: ...
 
     def poses(self, unit: str, phase: str, guide: Any) -> None:
         self._at(unit, phase, guide.found)

@@ -212,4 +212,4 @@ def test_the_operator_is_asked_for_the_directions_that_determine_the_biases() ->
     targets = bias_directions(4)
     state = guide([], wanted=4, hold_s=1.0, apart_deg=10.0, now_s=0.0, nominal_scale_factor=(1, 1, 1), targets=targets)
     assert state.missing == tuple(label for label, _ in targets)
-    assert state.hint == f"next: {targets[0][0]} up"
+    assert state.text == f"next: {targets[0][0]} up"

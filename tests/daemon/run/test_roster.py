@@ -12,10 +12,11 @@ import pytest
 from triaxcald.errors import DISK, INTERRUPTED, DiskError, RecordingError
 from triaxcald.recording.schema import Phase
 from triaxcald.run.recording import AtRecording, Kept, Roster, State
+from triaxcald.schema.codes import Stage
 from triaxcald.station.guidance import Guide
 from triaxcald.station.listening import RawRecords
 from triaxcald.station.reconnect import RetryPolicy
-from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP, nothing_deleted
+from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP, IS_BACK, STAGES, nothing_deleted
 
 
 class Shown:
@@ -24,10 +25,16 @@ class Shown:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, STAGES[stage])
+
+    def back(self, unit: str) -> None:
+        self.note(unit, IS_BACK)
+
+    def note(self, unit: str, text: str) -> None:
         self.lines.append(text)
 
-    def lost(self, unit: str, trouble: str) -> None:
+    def lost(self, unit: str, code: object, trouble: str) -> None:
         self.lines.append(f"lost: {trouble}")
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...

@@ -19,10 +19,12 @@ from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import Kept, Roster, State, UnitRecording
 from triaxcald.run.session import UnitSession
+from triaxcald.schema.codes import Stage
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.station.config import Station, load_station
 from triaxcald.station.lock import locked
 from triaxcald.station.reconnect import RetryPolicy
+from triaxcald.text import IS_BACK, STAGES
 
 
 class Told:
@@ -31,11 +33,17 @@ class Told:
     def __init__(self) -> None:
         self.stages: dict[str, list[str]] = {}
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, STAGES[stage])
+
+    def back(self, unit: str) -> None:
+        self.note(unit, IS_BACK)
+
+    def note(self, unit: str, text: str) -> None:
         self.stages.setdefault(unit, []).append(text)
 
-    def lost(self, unit: str, trouble: str) -> None:
-        self.stage(unit, f"lost: {trouble}")
+    def lost(self, unit: str, code: object, trouble: str) -> None:
+        self.note(unit, f"lost: {trouble}")
 
     def poses(self, *_: object) -> None: ...
 

@@ -30,20 +30,20 @@ def _guide(poses: Sequence[Pose], now_s: float = 1000.0, **more: Any) -> Guide:
 def test_at_first_the_first_pose_of_the_plan_is_next() -> None:
     state = _guide([], now_s=0.0)
     assert (state.found, state.wanted, state.held_s, state.complete) == (0, 14, 0.0, False)
-    assert state.hint == "next: +X up"
+    assert state.text == "next: +X up"
     assert list(state.missing) == LABELS
 
 
 def test_a_direction_that_only_a_number_names_is_told_by_its_components() -> None:
     label, (x, y, z) = directions(20)[0]
     assert label.startswith("N")
-    assert _guide([], wanted=20).hint == f"next: {label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+    assert _guide([], wanted=20).text == f"next: {label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
 
 
 def test_a_pose_that_is_there_is_not_asked_for_again() -> None:
     state = _guide([_pose(UP[0])])
     assert state.found == 1
-    assert state.hint == f"next: {LABELS[1]} up"
+    assert state.text == f"next: {LABELS[1]} up"
     assert list(state.missing) == LABELS[1:]
 
 
@@ -51,13 +51,13 @@ def test_a_pose_is_told_to_be_held_until_it_is_long_enough() -> None:
     state = _guide([_pose(UP[0], seconds=1.25)], now_s=1.4)
     assert state.found == 0
     assert state.held_s == 1.25
-    assert state.hint.startswith("hold still, 1.2 of 3.0 s")
+    assert state.text.startswith("hold still, 1.2 of 3.0 s")
 
 
 def test_a_short_pose_that_is_over_does_not_count() -> None:
     state = _guide([_pose(UP[0], seconds=1.25)], now_s=5.0)
     assert (state.found, state.held_s) == (0, 0.0)
-    assert state.hint == f"next: {LABELS[0]} up"
+    assert state.text == f"next: {LABELS[0]} up"
 
 
 def test_poses_near_to_each_other_count_once() -> None:
@@ -79,7 +79,7 @@ def test_the_signs_of_the_scale_factor_turn_the_unit_round() -> None:
 
 def test_enough_distinct_poses_are_done_and_more_do_not_count() -> None:
     state = _guide([_pose(u, 5.0 * i) for i, u in enumerate(UP)])
-    assert (state.found, state.hint, state.complete) == (14, "done", True)
+    assert (state.found, state.text, state.complete) == (14, "done", True)
     more = _guide([_pose(u, 5.0 * i) for i, (_, u) in enumerate(directions(26))])
     assert (more.found, more.complete) == (14, True)
 
@@ -90,10 +90,10 @@ def test_the_first_pose_is_wanted_again_when_all_others_are_there_and_not_before
     assert (almost.found, almost.repeat_due, almost.missing) == (13, False, (LABELS[13],))
     due = _guide(taken, repeat=True)
     assert (due.found, due.repeat_due, due.complete) == (14, True, False)
-    assert due.hint == f"next: {LABELS[0]} up once more: the first pose again shows drift"
+    assert due.text == f"next: {LABELS[0]} up once more: the first pose again shows drift"
     near = UP[0] + np.array([0, np.sin(np.radians(6)), 0])
     done = _guide([*taken, _pose(near, 100.0)], repeat=True)
-    assert (done.repeat_due, done.complete, done.hint) == (False, True, "done")
+    assert (done.repeat_due, done.complete, done.text) == (False, True, "done")
     assert _guide([*taken, _pose(UP[1], 100.0)], repeat=True).repeat_due
     assert _guide([*taken, _pose(UP[0], 100.0, seconds=1.0)], repeat=True).repeat_due
 
@@ -101,14 +101,14 @@ def test_the_first_pose_is_wanted_again_when_all_others_are_there_and_not_before
 def test_the_pose_to_repeat_is_the_first_that_was_taken_in_whatever_order() -> None:
     other = [UP[3], *UP[:3], *UP[4:]]
     due = _guide([_pose(u, 5.0 * i) for i, u in enumerate(other)], repeat=True)
-    assert due.hint == f"next: {LABELS[3]} up once more: the first pose again shows drift"
+    assert due.text == f"next: {LABELS[3]} up once more: the first pose again shows drift"
     assert _guide([_pose(u, 5.0 * i) for i, u in enumerate([*other, UP[3]])], repeat=True).complete
 
 
 def test_poses_in_any_order_leave_the_rest_of_the_plan_in_its_order() -> None:
     state = _guide([_pose(UP[i], 5.0 * i) for i in (7, 2, 11)])
     assert list(state.missing) == [label for i, label in enumerate(LABELS) if i not in (2, 7, 11)]
-    assert state.hint == f"next: {LABELS[0]} up"
+    assert state.text == f"next: {LABELS[0]} up"
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_in_a_dense_plan_a_pose_covers_the_direction_that_it_is_nearest_to_alone
 def test_without_a_plan_any_pose_will_do() -> None:
     state = _guide([_pose(UP[0])], plan=False, wanted=3)
     assert state.missing == ()
-    assert state.hint == "turn the unit to a pose not taken yet"
+    assert state.text == "turn the unit to a pose not taken yet"
 
 
 def test_without_a_nominal_scale_factor_the_range_of_the_outputs_serves() -> None:
@@ -149,9 +149,9 @@ CHECK = {"plan": False, "wanted": 3, "apart_from": np.array(UP)}
 
 
 def test_check_poses_are_asked_for_in_other_attitudes_than_the_fits() -> None:
-    assert _guide([], **CHECK).hint == f"next: {ELSEWHERE[0][0]} up"
+    assert _guide([], **CHECK).text == f"next: {ELSEWHERE[0][0]} up"
     state = _guide([_pose(ELSEWHERE[0][1])], **CHECK)
-    assert (state.found, state.hint) == (1, f"next: {ELSEWHERE[1][0]} up")
+    assert (state.found, state.text) == (1, f"next: {ELSEWHERE[1][0]} up")
     near = UP[3] + np.array([0.0, np.sin(np.radians(6)), 0.0])
     assert _guide([_pose(near)], **CHECK).found == 0
     assert _guide([_pose(v, 5.0 * i) for i, (_, v) in enumerate(ELSEWHERE)], **CHECK).complete

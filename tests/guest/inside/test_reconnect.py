@@ -24,9 +24,11 @@ from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
 from triaxcald.run.recording import State, UnitRecording
 from triaxcald.run.session import UnitSession
+from triaxcald.schema.codes import Stage
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE
 from triaxcald.station.reconnect import RetryPolicy
+from triaxcald.text import IS_BACK, STAGES
 
 STATION = """\
 format = "triaxcal.station/1"
@@ -59,10 +61,16 @@ class Told:
     def __init__(self) -> None:
         self.said: list[str] = []
 
-    def stage(self, unit: str, text: str) -> None:
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.note(unit, STAGES[stage])
+
+    def back(self, unit: str) -> None:
+        self.note(unit, IS_BACK)
+
+    def note(self, unit: str, text: str) -> None:
         self.said.append(text)
 
-    def lost(self, unit: str, trouble: str) -> None:
+    def lost(self, unit: str, code: object, trouble: str) -> None:
         self.said.append(f"lost: {trouble}")
 
     def poses(self, *_: object) -> None: ...
