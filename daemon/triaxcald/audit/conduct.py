@@ -35,7 +35,7 @@ from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
-from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Code, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.manifest import is_manifest
@@ -363,7 +363,8 @@ class _Audit:
         if again.written and not self._aborted and provisioned is None:
             self._add(EVENTS, Kind.MISSING, "provisioned")
         if self._outcome:
-            reason = self._outcome.get("reason") if self._aborted else None
+            killed = self._outcome.get("code") == Code.KILLED  # which wrote no event any more
+            reason = self._outcome.get("reason") if self._aborted and not killed else None
             if failed != reason:
                 self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)
             state = self._outcome.get("device_state")

@@ -42,13 +42,16 @@ class EventLines:
 
     def __enter__(self) -> EventLines:
         self._thread.start()
-        self._say("tray", None, state="started")
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._say("tray", None, state="ended")
+        if self._seq:
+            self._say("tray", None, state="ended")
         self._lines.put(None)
         self._thread.join(DRAIN_S)
+
+    def begun(self) -> None:
+        self._say("tray", None, state="started")
 
     # Progress.
 

@@ -19,15 +19,17 @@ from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage
+from triaxcald.run.attempts import settle_killed
 from triaxcald.run.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.schema.codes import Stage
-from triaxcald.station.config import Place, days_since_1970, load_station
+from triaxcald.station.config import Place, Station, days_since_1970, load_station
 
 
 def provision_command(a: argparse.Namespace) -> int:
     if a.resume == (a.calibration is not None):
         raise InputError("provision: give CAL.json, or --resume without one")
     station = load_station(a.station)
+    _settle_killed(station)
     place = station.place(a.unit)
     image, serial = (None, None) if a.resume else image_from(a.calibration, place)
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
@@ -41,6 +43,12 @@ def provision_command(a: argparse.Namespace) -> int:
         elif done.error is None:
             _show(done, place, station.path, dry_run=a.dry_run)
     return done.exit_code
+
+
+def _settle_killed(station: Station) -> None:
+    """Write the outcomes of runs that were killed in the station's folder."""
+    for killed in settle_killed(station):
+        say(killed.line)
 
 
 def _told(done: Provisioned, station: Path) -> str:
@@ -182,6 +190,7 @@ def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | No
 
 def restore_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
+    _settle_killed(station)
     names = [place.unit.name for place in station.places]
     theirs = unit_in(a.source)
     place = station.place(a.unit or (theirs if theirs in names else None))

@@ -53,9 +53,14 @@ def run_command(a: argparse.Namespace) -> int:
             for receiver in receivers:
                 receiver.ended(outcome)
 
+        def begun() -> None:
+            for events in receivers[1:]:
+                events.begun()
+
         tray = run_station(
-            station, Several(receivers), force=a.force, rezero=rezero, ended=ended, killed=lambda k: say(k.line)
-        )
+            station, Several(receivers), force=a.force, rezero=rezero,
+            ended=ended, killed=lambda killed: say(killed.line), begun=begun,
+        )  # fmt: skip
         if a.events:
             runs = {slot: unit.run for slot, unit in tray.units.items()}
             receivers.append(stack.enter_context(EventLines(sys.stdout, tray.id, runs)))

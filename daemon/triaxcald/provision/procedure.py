@@ -368,6 +368,7 @@ class Provisioning:
             journals = journals_of(self.folder, self.owner, self.bundle.profile)
             mine = [(j, e) for j, e in journals if j.path == self.source or (e.serial and e.before == snapshot.raw)]
             self._earlier = list(dict.fromkeys([*(j for j, _ in mine), *self._named_for_it(journals)]))
+            self._journals = mine
             if mine:  # the wanted image is known: a device that holds it is not in a mixed state
                 self.image = image_of(self.bundle.profile, mine[0][1].wanted)
         if self.differing and not self._earlier:

@@ -39,6 +39,8 @@ except ImportError:
 
 FOLDER: Final = "running"
 FORMAT: Final = "triaxcal.attempt/1"
+DAMAGED: Final = ".mcap.damaged"
+"""Suffix of what a killed process left, where mending it loses something."""
 PAPERS: Final = (CERTIFICATE, REPORT)
 """Attachments that state an ending, which a killed run did not reach."""
 
@@ -186,9 +188,12 @@ def settle_killed(station: Station) -> list[Killed]:
             trays.setdefault(file.tray, []).append(file)
     found = []
     for tray, files in trays.items():
-        with _abandoned(within / f"{tray}.lock") as abandoned:
-            if abandoned:
-                found += [killed for file in files if file.path.exists() and (killed := _settle(station, file))]
+        try:
+            with _abandoned(within / f"{tray}.lock") as abandoned:
+                if abandoned:
+                    found += [killed for file in files if file.path.exists() and (killed := _settle(station, file))]
+        except OSError as e:
+            raise DiskError(f"{e.filename or within}: {e.strerror}; a killed run has no outcome yet") from e
     return found
 
 
@@ -222,16 +227,19 @@ def _settle(station: Station, file: AttemptFile) -> Killed | None:
         file.remove()
         return None
     attempt = replace(file.attempt, recording=None if recording is None else recording.name)
-    document = _document(station, file, attempt, None)
-    if recording is None:
-        stem = f"{attempt.work.slot}-{file.serial or 'unknown'}-{_stamp(attempt.started)}"
-        path = write_new(station.folder, stem, SUFFIX, to_text(document))
-    else:
+    document = None
+    if recording is not None:
         try:
             document = _mended(station, file, attempt, recording)
-        except (RecordingError, tc.Refused):  # nothing in it can be read: it stays as it is
-            document = _document(station, file, attempt, None)
+        except (RecordingError, tc.Refused):  # nothing in it can be read: it is kept, and is no recording
+            os.replace(recording, recording.with_suffix(DAMAGED))
+            attempt = replace(attempt, recording=None)
+    if recording is not None and document is not None:
         path = write_text(recording.with_suffix(f".{ATTACHMENT}"), to_text(document))
+    else:
+        document = _document(station, file, attempt, None)
+        stem = f"{attempt.work.slot}-{file.serial or 'unknown'}-{_stamp(attempt.started)}"
+        path = write_new(station.folder, stem, SUFFIX, to_text(document))
     file.remove()
     return Killed(document, path, text.killed(attempt.work.slot, attempt.started, path, document, station.path))
 
@@ -279,7 +287,7 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
         sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), to_text(document).encode())
         recovery = recover(recording, mended, without=PAPERS, sealed=sealed)
         if not recovery.lossless:  # what could not be read may be read by somebody else
-            os.replace(recording, recording.with_suffix(".mcap.damaged"))
+            os.replace(recording, recording.with_suffix(DAMAGED))
         os.replace(mended, recording)
         synchronise(recording.parent)
     except OSError as e:

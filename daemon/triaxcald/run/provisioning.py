@@ -43,10 +43,11 @@ from triaxcald.recording.reader import Recording
 from triaxcald.run.endings import aborted
 from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 from triaxcald.schema.codes import Stage
-from triaxcald.software import software
+from triaxcald.software import new_run_id, software
 from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
+from triaxcald.work import Attempt, Work
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,13 @@ class ProvisionRun:
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
     warnings: Sequence[SanityWarning] = field(default=(), init=False)
+    id: str = field(default_factory=new_run_id, init=False)
     _begun: Provisioning | None = field(default=None, init=False)
+    _attempt: Attempt = field(init=False)
+
+    def __post_init__(self) -> None:
+        work = Work(self.place.unit.name, self.serial or self.place.unit.serial)
+        self._attempt = Attempt(self.id, self._now(), work)
 
     async def run(self) -> Provisioned:
         """Provision. Raises nothing, not even when cancelled: the outcome has every
@@ -145,7 +152,8 @@ class ProvisionRun:
             folder=self.station.folder,
             expected_serial=self.serial or self.place.unit.serial,
             where=self.place.address,
-            started=self._now(),
+            started=self._attempt.started,
+            run=self.id,
             power_cycle=power_cycle_asked(self.ask, link, self.place, self.station) if self.ask else None,
         )
         return p
@@ -187,6 +195,11 @@ class ProvisionRun:
 
     def _document(self, ending: Ending) -> tc.interchange.Document:
         p = self.provisioning
+        history = History.of(self.station.folder, p.identity.serial) if p else History()
+        work = self._attempt.work
+        if p is not None and p.identity.serial is not None:
+            work = replace(work, attempt=history.attempts + 1)
+        settles = p.settles if p is not None and p.settled and not self.dry_run else None
         return outcome_document(
             ending,
             self._held,
@@ -196,9 +209,10 @@ class ProvisionRun:
             station=self.station.file.name,
             ended=self._now(),
             software=software(),
-            supersedes=History.of(self.station.folder, p.identity.serial).latest if p else None,
+            supersedes=history.latest,
             journal=str(self._open_journal) if self._open_journal else None,
             forced=self.force if self.warnings else None,
+            attempt=replace(self._attempt, work=work, settles=settles),
         )
 
     def _write(self, document: tc.interchange.Document) -> Path:

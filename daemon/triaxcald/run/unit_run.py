@@ -21,7 +21,7 @@ from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
-from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
+from triaxcald.errors import DISK, REFUSED, DiskError, InputError, RecordingError
 from triaxcald.files import write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
@@ -155,7 +155,8 @@ class UnitRun(UnitSession):
     async def _run(self, tray: Attempts) -> Outcome:
         ending: Ending | None = None
         try:
-            self._attempt_file = await asyncio.to_thread(tray.begin, self._attempt)
+            if self._attempt_file is None:
+                await asyncio.to_thread(self.begin, tray)
             policy = RetryPolicy(others=self.others)
             async with self.place.opened(policy, partial(self.waits, policy)) as device:
                 identity = await self.identify(device)
@@ -189,6 +190,15 @@ class UnitRun(UnitSession):
             if self._attempt_file is not None:
                 self._attempt_file.remove()
         return self._outcome(ending)
+
+    def begin(self, tray: Attempts) -> None:
+        """Note the attempt on the disk. Raises DiskError."""
+        self._attempt_file = tray.begin(self._attempt)
+
+    def withdraw(self) -> None:
+        """Forget an attempt that did not begin."""
+        if self._attempt_file is not None:
+            self._attempt_file.remove()
 
     def stop(self, reason: str) -> None:
         """Note the reason of a stop, which a cancellation of `run` has to follow."""
@@ -559,9 +569,10 @@ class TrayRun:
         work: Mapping[str, Work] | None = None,
         ended: Callable[[Outcome], None] = lambda _: None,
         killed: Callable[[Killed], None] = lambda _: None,
+        begun: Callable[[], None] = lambda: None,
     ) -> None:
         self.id = new_run_id()
-        self._station, self._ended, self._killed = station, ended, killed
+        self._station, self._ended, self._killed, self._begun = station, ended, killed, begun
         self._serials, self._others = SerialsSeen(), ActiveUnits(len(station.places))
         self._attempts = Attempts(station.folder, self.id, station.file.name)
         self._runs = [
@@ -580,9 +591,18 @@ class TrayRun:
 
     async def _all(self) -> list[Outcome]:
         """Raises InputError if the folder cannot be used."""
-        for killed in await asyncio.to_thread(settle_killed, self._station):
-            self._killed(killed)
         with self._attempts.under_way(), ExitStack() as stack:
+            for run in self._runs:
+                with suppress(DiskError):  # its own run reports it
+                    await asyncio.to_thread(run.begin, self._attempts)
+            self._begun()
+            try:
+                for killed in await asyncio.to_thread(settle_killed, self._station):
+                    self._killed(killed)
+            except BaseException:
+                for run in self._runs:
+                    run.withdraw()
+                raise
             for run in self._runs:
                 stack.enter_context(at_abort(run.abort_notice))
             for run in self._runs:
@@ -604,6 +624,7 @@ class TrayRun:
 def run_station(station: Station, progress: Progress, **settings: Any) -> TrayRun:
     """The units of a station, to be awaited; ``settings`` as in `TrayRun`: ``ended``
     receives each outcome, ``killed`` each attempt that an earlier process left,
+    ``begun`` is called once the attempts are noted on the disk,
     ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
     maps it to what it is measured for."""
     return TrayRun(station, progress, **settings)

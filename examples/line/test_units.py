@@ -1,0 +1,31 @@
+"""pytest: a tray is calibrated once, and each slot is a test: `pytest test_units.py`, with STATION in the environment."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+STATION = Path(os.environ["STATION"])
+SLOTS = [unit["name"] for unit in tomllib.loads(STATION.read_text())["units"]]
+
+
+@pytest.fixture(scope="session")
+def outcomes() -> dict:
+    """The outcome of each slot."""
+    command = [sys.executable, "-m", "triaxcald.cli", "run", str(STATION), "--events"]
+    events = map(json.loads, subprocess.run(command, stdout=subprocess.PIPE, text=True).stdout.splitlines())
+    return {event["unit"]: event["outcome"] for event in events if event["event"] == "ended"}
+
+
+@pytest.mark.parametrize("slot", SLOTS)
+def test_unit(slot: str, outcomes: dict, record_property) -> None:
+    outcome = outcomes[slot]
+    record_property("serial", outcome["serial"])
+    record_property("code", outcome["code"])
+    if outcome["measured"]:
+        record_property("rms_g", outcome["measured"]["after"]["rms_g"])
+    assert outcome["verdict"] == "pass", outcome["reason"]

@@ -1,0 +1,258 @@
+"""The units of a tray: their events, their handles, and one outcome for each attempt."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+from tests.daemon.audit.forging import Forgery
+from tests.virtual_line import described, virtual_line
+from triaxcald.audit import audit
+from triaxcald.cli.events import EventLines
+from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.run.attempts import FOLDER, Attempts, settle_killed
+from triaxcald.run.unit_run import Outcome, run_station
+from triaxcald.schema.codes import Stage
+from triaxcald.schema.event import Event
+from triaxcald.station.config import load_station
+from triaxcald.work import Attempt, Work
+
+EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+PLAN = {"poses": 9, "hold_s": 1.0, "check_poses": 3}
+
+
+class Quiet:
+    """Shows nothing; ``at`` is called at each state of the poses."""
+
+    def __init__(self, at: Callable[[str, int], None] = lambda unit, found: None) -> None:
+        self._at = at
+
+    def stage(self, unit: str, stage: Stage) -> None: ...
+    def note(self, unit: str, text: str) -> None: ...
+    def lost(self, unit: str, code: object, reason: str) -> None: ...
+    def back(self, unit: str) -> None: ...
+
+    def poses(self, unit: str, phase: str, guide: Any) -> None:
+        self._at(unit, guide.found)
+
+
+@pytest.fixture
+def bench(workshop: Any) -> Iterator[Path]:
+    """A station of two simulated units, on a virtual clock."""
+    can_bus = {"interface": "virtual", "channel": "tray", "node_id": 5}
+    modbus_bus = {"host": "127.0.0.1", "port": 502}
+    can = workshop.device("can.toml", profile="triax-ref-can", bus=can_bus)
+    modbus = workshop.device("modbus.toml", bus=modbus_bus, serial=4712, seed=4)
+    station = workshop.station(
+        {"name": "left", "profile": "triax-ref-can", "serial": "4711", "bus": can_bus},
+        {"name": "right", "serial": "4712", "bus": modbus_bus},
+        plan=PLAN,
+    )
+    with virtual_line(described(can), described(modbus)):
+        yield station
+
+
+def test_every_event_is_of_the_model_and_the_outcome_comes_when_its_unit_ends(bench: Path, triaxcal: Any) -> None:
+    done = triaxcal("run", bench, "--events", "--operator", "A. Smith", "--order", "WO 7")
+    assert done.code == 0
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    for line in lines:
+        assert EVENT.validate_python(line).document() == line
+    assert [line["seq"] for line in lines] == list(range(1, len(lines) + 1))
+    assert len({line["tray"] for line in lines}) == 1
+    assert [line["state"] for line in lines if line["event"] == "tray"] == ["started", "ended"]
+    assert (lines[0]["event"], lines[-1]["event"]) == ("tray", "tray")
+    for line in lines:
+        at = datetime.fromisoformat(line["time"])
+        assert (at.utcoffset(), line["time"][-6:], len(line["time"])) == (UTC.utcoffset(at), "+00:00", 29)
+    for slot, serial in ("left", "4711"), ("right", "4712"):
+        own = [line for line in lines if line["unit"] == slot]
+        (run,) = {line["run"] for line in own}
+        stages = [line["stage"] for line in own if line["event"] == "stage"]
+        assert stages == ["identity", "poses", "fitting", "writing", "check_poses", "report"]
+        assert own[-1]["event"] == "ended"
+        outcome = own[-1]["outcome"]
+        assert (outcome["run"], outcome["unit"], outcome["serial"]) == (run, slot, serial)
+        (path,) = bench.parent.glob(f"{slot}-*.outcome.json")
+        assert json.loads(path.read_bytes()) == outcome
+        assert outcome["work"] == {
+            "serial": serial, "operator": "A. Smith", "order": "WO 7", "batch": None, "part_number": None,
+            "fixture": None, "slot": slot, "attempt": 1, "reason": None,
+        }  # fmt: skip
+        poses = [line for line in own if line["event"] == "poses"]
+        first = [p for p in poses if p["wanted"] == PLAN["poses"]]
+        assert first[0]["found"] < first[-1]["found"] == PLAN["poses"]
+        assert all(a != b for a, b in pairwise(poses))
+        for p in poses:
+            if p["next"] is not None:
+                assert sum(v * v for v in p["next"]["vector"]) == pytest.approx(1, abs=1e-5)
+        assert any(p["next"] and p["next"]["once_more"] for p in first)
+
+
+def test_a_second_run_is_the_second_attempt_and_supersedes_the_first(bench: Path, triaxcal: Any) -> None:
+    held = []
+    for _ in range(2):
+        done = triaxcal("run", bench, "--events")
+        ended = [json.loads(line) for line in done.out.splitlines() if '"ended"' in line]
+        held.append({e["unit"]: e["outcome"] for e in ended if e["event"] == "ended"})
+    for slot in "left", "right":
+        first, second = held[0][slot], held[1][slot]
+        assert (first["work"]["attempt"], second["work"]["attempt"]) == (1, 2)
+        assert first["supersedes"] is None
+        assert second["supersedes"] is not None
+        assert first["run"] < second["run"]  # they sort by time
+
+
+def test_one_unit_is_stopped_with_a_reason_while_the_other_goes_on(bench: Path) -> None:
+    ended: list[str] = []
+
+    async def work() -> list[Outcome]:
+        def at(unit: str, found: int) -> None:
+            if unit == "left" and found == 3:
+                tray.units["left"].stop("wrong label")
+
+        tray = run_station(load_station(bench), Quiet(at), ended=lambda o: ended.append(o.unit))
+        outcomes = await tray
+        assert all(handle.ended for handle in tray.units.values())
+        return outcomes
+
+    left, right = asyncio.run(work())
+    assert ended == ["left", "right"]
+    assert (left.exit_code, left.document["code"], left.document["reason"]) == (130, "stopped", "stopped: wrong label")
+    assert (right.exit_code, right.document["code"]) == (0, "no_limit")
+    assert left.recording is not None
+    assert audit(left.recording).differences == ()
+    assert list(bench.parent.glob(f"{FOLDER}/*")) == []
+
+
+def test_json_and_events_exclude_each_other(bench: Path, triaxcal: Any) -> None:
+    triaxcal("run", bench, "--events", "--json").failed(2, "--events", "--json")
+    assert list(bench.parent.glob("*.outcome.json")) == []
+
+
+@pytest.mark.parametrize("broken", [BrokenPipeError, ValueError])
+def test_a_vanished_reader_of_the_events_stops_nothing(broken: type[Exception]) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise broken
+
+    with EventLines(Gone(), "tray", {"u": "run"}) as events:
+        events.begun()
+        for _ in range(1000):
+            events.stage("u", Stage.POSES)
+
+
+# Killed runs. The recording is cut off at any byte, as a killed process leaves it.
+
+
+class Killed:
+    """A folder with the attempt of a killed process, whose recording is cut off."""
+
+    def __init__(self, folder: Path, station: Path, recording: Path) -> None:
+        self.folder, self.station = folder, station
+        self._whole = recording.read_bytes()
+        self.work = Work("modbus", serial="4712", order="WO 7", attempt=1)
+        self.attempt = Attempt("0193f0e4-0000-7000-8000-000000000001", "2026-03-02T09:00:00.000+00:00", self.work)
+
+    def leave(self, cut: int | None, **more: Any) -> None:
+        tray = Attempts(self.folder, "0193f0e4-0000-7000-8000-00000000000f", "bench")
+        name = "modbus-4712-20260302T090000Z.mcap"
+        with contextlib.suppress(OSError):
+            (self.folder / FOLDER).mkdir()
+        attempt = self.attempt if cut is None else Attempt(**{**vars(self.attempt), "recording": name})
+        file = tray.begin(attempt)
+        for key, value in more.items():
+            setattr(file, key, value)
+        file.write()
+        if cut is not None:
+            (self.folder / name).write_bytes(self._whole[:cut])
+
+    def settled(self) -> Mapping[str, Any]:
+        (killed,) = settle_killed(load_station(self.station))
+        assert json.loads(killed.path.read_bytes()) == killed.document
+        assert not (self.folder / FOLDER).exists()
+        assert settle_killed(load_station(self.station)) == []
+        return killed.document
+
+
+@pytest.fixture
+def killed(finished_run: Any, tmp_path: Path) -> Killed:
+    """The finished run, without the documents that it ended with and with the metadata of its attempt."""
+    bus = {"host": "127.0.0.1", "port": 502}
+    station = tmp_path / "station.toml"
+    text = 'format = "triaxcal.station/1"\nname = "bench"\n[[units]]\nname = "modbus"\nprofile = "triax-ref-modbus"\n'
+    station.write_text(text + f'bus = {{ host = "{bus["host"]}", port = {bus["port"]} }}\n')
+    return Killed(tmp_path, station, finished_run.modbus)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.37, 0.5, 0.73, 0.9, 0.99])
+def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Killed, share: float) -> None:
+    killed.leave(round(len(killed._whole) * share), serial="4712")
+    held = killed.settled()
+    assert (held["verdict"], held["code"], held["exit_code"]) == ("aborted", "killed", None)
+    assert (held["run"], held["serial"], held["work"]["order"]) == (killed.attempt.run, "4712", "WO 7")
+    assert (held["device_state"], held["journal"]) == ("untouched", None)
+    recordings = list(killed.folder.glob("*.mcap"))
+    if held["recording"] is None:  # not even its head was there: what is left of it is kept
+        assert recordings == []
+        assert len(list(killed.folder.glob("*.damaged"))) == 1
+    else:
+        (recording,) = recordings
+        assert recording.name == held["recording"]
+        names = [r.name for r in Forgery.of(recording).records if hasattr(r, "media_type")]
+        assert names[-1] == "outcome.json"
+        assert not {"certificate.json", "report.html"} & set(names)
+
+
+def test_an_attempt_that_was_killed_before_its_recording_gets_an_outcome(killed: Killed) -> None:
+    killed.leave(None)
+    held = killed.settled()
+    assert (held["code"], held["recording"], held["serial"], held["contents"]) == ("killed", None, None, None)
+    assert len(list(killed.folder.glob("modbus-unknown-*.outcome.json"))) == 1
+
+
+def test_a_run_that_was_killed_after_its_end_keeps_its_own_outcome(killed: Killed) -> None:
+    killed.leave(len(killed._whole), serial="4712")
+    assert settle_killed(load_station(killed.station)) == []
+    (outcome,) = killed.folder.glob("*.outcome.json")
+    own = next(r.data for r in Forgery.of(next(killed.folder.glob("*.mcap"))).records if _is_outcome(r))
+    assert outcome.read_bytes() == own
+    assert not (killed.folder / FOLDER).exists()
+
+
+def _is_outcome(record: Any) -> bool:
+    return getattr(record, "name", None) == "outcome.json" and hasattr(record, "data")
+
+
+def test_a_journal_leaves_the_device_unknown_and_is_named(killed: Killed) -> None:
+    journal = killed.folder / "journal" / "TRIAX-REF-4712.json"
+    killed.leave(None, serial="4712", held=Held(DeviceState.NEW_VERIFIED, Evidence.RESTART))
+    journal.parent.mkdir()
+    journal.write_text("{}")
+    held = killed.settled()
+    assert (held["device_state"], held["evidence"]) == ("unknown", "no_answer")
+    assert held["journal"] == str(journal)
+
+
+def test_without_a_journal_the_settled_state_is_stated(killed: Killed) -> None:
+    killed.leave(None, serial="4712", held=Held(DeviceState.NEW_VERIFIED, Evidence.RESTART))
+    held = killed.settled()
+    assert (held["device_state"], held["evidence"]) == ("new_verified", "read_after_restart")
+
+
+def test_an_attempt_under_way_is_left_alone(killed: Killed) -> None:
+    tray = Attempts(killed.folder, "0193f0e4-0000-7000-8000-00000000000f", "bench")
+    with tray.under_way():
+        tray.begin(killed.attempt)
+        assert settle_killed(load_station(killed.station)) == []
+    assert len(settle_killed(load_station(killed.station))) == 1
