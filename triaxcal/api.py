@@ -20,8 +20,8 @@ from triaxcal.estimate import pose_fit
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.poses_from_means import poses_of_means
-from triaxcal.evidence.findings import Unexplained
 from triaxcal.evidence.partial_residuals import Trace
+from triaxcal.evidence.posterior import Unexplained
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions

@@ -18,13 +18,11 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, ReferenceEpoch
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.corrected_calibration import corrected
-from triaxcal.evidence.findings import Findings, Named, NotIdentifiable, findings, not_identifiable, stated
-from triaxcal.evidence.model_average import Refusal, average
+from triaxcal.evidence.mixture import OF_DIRECTION
+from triaxcal.evidence.model_average import Refusal, average, corrected
 from triaxcal.evidence.next_measurement import Advice, advice, decided
-from triaxcal.evidence.over_sphere import OF_DIRECTION
 from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
-from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.posterior import Findings, Named, NotIdentifiable, Posterior, findings, not_identifiable, stated
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.search import considered, posterior_of
 from triaxcal.evidence.terms import faults_of

@@ -5,12 +5,11 @@ effects, outliers and what has no name.
 against what went before.
 """
 
-from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained, findings
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind, Advice, Expected, advice
 from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace, unit_of
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.posterior import ChangePoint, Findings, Named, Posterior, Unexplained, findings
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.search import posterior_of
 

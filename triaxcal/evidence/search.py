@@ -18,11 +18,11 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import State, linearise_all
 from triaxcal.estimate.recordings import by_run
+from triaxcal.evidence.covariances import inverse_of
 from triaxcal.evidence.likelihood import Evidence, SetEvidence
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose

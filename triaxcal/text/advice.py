@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 
 from triaxcal.diagnosis import Loop, Recommendation, Verdict
 from triaxcal.effects.plugins import package_of
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.number_format import plain
 from triaxcal.planning.addition import ChannelRange
 from triaxcal.poses.pose import Pose

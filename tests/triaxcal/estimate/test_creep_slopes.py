@@ -20,7 +20,7 @@ from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import State, linearise, linearise_all, residual_sum_of_squares, solve
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Posterior, Refusal, posterior_of
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import StillnessDetector

@@ -20,9 +20,9 @@ from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.hold_out import Contradiction
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.partial_residuals import Quantity
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange.calibration_document import calibration_document, poses_document
 from triaxcal.model.directions import directions
