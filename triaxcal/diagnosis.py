@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
+from triaxcal.effects.catalogue import plugins
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, ReferenceEpoch
 from triaxcal.estimate.hold_out import HoldOut, held_out

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.catalogue import CATALOGUE
+from triaxcal.effects.catalogue import CATALOGUE, package_of, plugins
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import (
     BEFORE,
@@ -30,7 +30,6 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.plugins import package_of, plugins
 from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, of_clocks, runs_named
 
 TEMPERATURE = "temp_c"

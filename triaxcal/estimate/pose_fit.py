@@ -10,8 +10,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import Effect, lag_in
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import (
     Calibration,

@@ -15,9 +15,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import SMOOTH, Empirical
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.evidence.covariances import (
     PoseInputs,

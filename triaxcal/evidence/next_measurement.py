@@ -13,8 +13,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import channel_of, is_derived
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.evidence.covariances import (
     PoseInputs,
     RowPrecision,

@@ -12,8 +12,8 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.effects import catalogue_for
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import State, linearise_all

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints, evenly_spread
+from triaxcal.effects.catalogue import EffectFault, is_foreign
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.odds import AXES, on_axes
-from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds

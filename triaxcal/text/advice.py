@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from triaxcal.diagnosis import Loop, Recommendation, Verdict
-from triaxcal.effects.plugins import package_of
+from triaxcal.effects.catalogue import package_of
 from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind

@@ -11,8 +11,8 @@ from scipy import stats
 
 from triaxcal.diagnosis import Verdict, diagnose
 from triaxcal.effects import effect_named
+from triaxcal.effects.catalogue import Foreign
 from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
-from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
 from triaxcal.estimate.creep import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.estimate.fit_assessment import Excess, cross_validated
