@@ -7,19 +7,89 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
-
 import numpy as np
-
 from triaxcal.arrays import Floats
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration, ReferenceEpoch, Residual, Unmodelled
-from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.interchange.calibration_document import WEIGHT
 from triaxcal.model.samples import Moment
-from triaxcal.model.sensor import Sensor
+from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.units import reference_unit_of
+from collections.abc import Mapping
+from dataclasses import replace
+from triaxcal.effects import TEMPERATURE
+from triaxcal.estimate.calibration import Origin
+from triaxcal.inputs.bias_update import Earlier
+from triaxcal.model.sensor import LINEAR
+from triaxcal.uncertainty.another_day import Source
+
+
+# The errors of a calibration as its document holds them: standard errors, and how
+# they go together.
+
+ROUNDED = 1e-4
+"""Documents round correlations to a millionth, so that the smallest eigenvalue
+may come out below zero."""
+
+
+def linear_errors_of(part: Mapping[str, Any], *, where: str) -> Floats:
+    """(9,) standard errors of scale factors, misalignments and biases. Raises
+    InvalidData."""
+    held = part.get("standard_error")
+    out = []
+    for name in LINEAR:
+        values = _numbers(held.get(name) if isinstance(held, Mapping) else None)
+        if values.shape != (3,) or not np.all(values >= 0):
+            raise InvalidData(f"{where}: standard_error.{name}: expected three numbers of at least 0")
+        out.append(values)
+    return np.concatenate(out)
+
+
+def effect_errors_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats:
+    """(p,) standard errors of the effects' coefficients. Raises InvalidData."""
+    out = []
+    for effect, _ in sensor.effects:
+        for k in effect.coefficients:
+            value = _numbers(part["effects"][effect.name][k.name].get("standard_error"))
+            if value.shape or not value >= 0:
+                name = f"effects.{effect.name}.{k.name}.standard_error"
+                raise InvalidData(f"{where}: {name}: expected a number of at least 0")
+            out.append(float(value))
+    return np.array(out)
+
+
+def correlation_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats | None:
+    """(9+p,9+p) in the order of `Calibration.parameters`; None where the
+    document has none. Raises InvalidData.
+
+    Values without a standard error go with nothing: zeros.
+    """
+    if "correlation" not in part:
+        return None
+    expected = [f"{name}.{axis}" for name in LINEAR for axis in "xyz"]
+    expected += [f"{effect.name}.{k.name}" for effect, _ in sensor.effects for k in effect.coefficients]
+    names = part.get("parameters", expected)
+    if not isinstance(names, list) or sorted(map(str, names)) != sorted(expected):
+        raise InvalidData(f"{where}: parameters: expected the names of all {len(expected)} coefficients")
+    held = _numbers(part["correlation"])
+    n = len(expected)
+    sound = held.shape == (n, n) and np.all(np.abs(held) <= 1 + ROUNDED) and np.all(np.abs(held - held.T) <= ROUNDED)
+    if not sound or np.linalg.eigvalsh(held)[0] < -ROUNDED * n:
+        raise InvalidData(f"{where}: correlation: expected a correlation matrix of {n} rows")
+    order = [names.index(name) for name in expected]
+    return np.asarray(held[np.ix_(order, order)])
+
+
+def _numbers(value: object) -> Floats:
+    """Finite numbers, an empty array where they are none."""
+    try:
+        out = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
+    return out if np.isfinite(out).all() else np.zeros(0)
+
 
 _WITH_CALIBRATION = ("triaxcal.calibration/1", "triaxcal.loop/1", "triaxcal.certificate/1")
 
@@ -236,3 +306,48 @@ def _in_budget(budget: Mapping[str, Any], key: str, parameter: str) -> float | N
         return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
     except (LookupError, TypeError, ValueError):
         return None
+
+
+# A calibration document as what is known of a unit before a later recording
+# (`triaxcal.inputs.bias_update`).
+
+def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Earlier:
+    """Of a calibration, loop or certificate document. Its covariance has what
+    the budget has beside the fit. Raises InvalidData."""
+    part = calibration_part(document, where=where)
+    fitted = calibration_of(part, where=where)
+    budget, following = part.get("uncertainty"), part.get("next_recording")
+    raised = uncertainty_over_error(budget if isinstance(budget, Mapping) else {}, fitted)
+    told = following if isinstance(following, Mapping) else {}
+    start_to_start = number_in(told.get("start_to_start_g"))
+    blind_to, alone = part.get("blind_to"), part.get("linear_only")
+    warm = logged_in(part, where=where).get(TEMPERATURE)
+    scatter, dof, noise = _scatter(part)
+    return Earlier(
+        replace(fitted, blind_to=tuple(map(str, blind_to)) if isinstance(blind_to, list) else ()),
+        fitted.covariance * np.outer(raised, raised),
+        scatter_g=scatter,
+        residual_dof=dof,
+        noise_g=noise,
+        start_to_start=start_to_start if start_to_start >= 0 else None,
+        measured=told.get("source") == Source.MEASURED.value,
+        temperatures_c=None if warm is None else (float(warm.min()), float(warm.max())),
+        origin=origin,
+        linear_only=earlier_in(alone, origin, where=f"{where}: linear_only") if isinstance(alone, Mapping) else None,
+    )
+
+
+def _scatter(part: Mapping[str, Any]) -> tuple[float, float, float]:
+    """By the residuals: a standard deviation of |a| that every pose had beside
+    its noise, by how many degrees of freedom, and one that has the noise in it.
+    An update hands on the first, which its few poses tell little of."""
+    residual, updated, poses = (part.get(name) for name in ("residual", "rezero", "poses"))
+    held = residual if isinstance(residual, Mapping) else {}
+    used = sum(bool(p.get("used", True)) for p in poses if isinstance(p, Mapping)) if isinstance(poses, list) else 0
+    if isinstance(updated, Mapping):
+        known, dof = (max(number_in(updated.get(name)), 0.0) for name in ("scatter_g", "scatter_dof"))
+        return known, dof, number_in(held.get("rms_g")) * math.sqrt(used / max(used - 3, 1))
+    left = max(used - LINEAR, 0)
+    variance = number_in(held.get("rms_g")) ** 2 * used / left if left else math.nan
+    beside = variance - number_in(held.get("noise_floor_g")) ** 2
+    return (math.sqrt(beside) if beside > 0 else 0.0), float(left), math.sqrt(variance)
