@@ -8,25 +8,29 @@ from triaxcal.interchange.calibration_document import (
     WEIGHT,
     Document,
     assumed_in,
+    attitudes_document,
     budget_document,
     calibration_document,
     coefficients_document,
+    datasheet_document,
     holds_of,
     poses_document,
     residual_document,
+    turning_document,
 )
 from triaxcal.interchange.calibration_reading import (
     but_is,
     calibration_of,
     calibration_part,
+    correlation_of,
+    effect_errors_of,
     expanded_uncertainty_in,
     holds_at_of,
+    linear_errors_of,
     logged_in,
     reference_unit_in,
     sensor_of,
 )
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.interchange.method_documents import attitudes_document, datasheet_document, turning_document
 
 if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings

@@ -1,27 +1,48 @@
-"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that
-others script against."""
+"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that others
+script against.
+
+A method other than still poses adds its results under a key of its own.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import BiasUpdate, Calibration, Exclusion, PoseResult, ReferenceEpoch, Residual, Unmodelled
+from triaxcal.estimate.calibration import (
+    BiasUpdate,
+    Calibration,
+    Exclusion,
+    PoseResult,
+    ReferenceEpoch,
+    Residual,
+    Unmodelled,
+)
+from triaxcal.inputs.attitude import AttitudeFit
+from triaxcal.inputs.datasheet import Refinement
+from triaxcal.inputs.turning.rotation import RotationFit
 from triaxcal.poses.pose import Pose
-from triaxcal.rounding import UNCERTAINTY_DIGITS, chance, correlation, direction, error, in_standard_errors, number, numbers, probability, uncertainty
+from triaxcal.rounding import (
+    UNCERTAINTY_DIGITS,
+    chance,
+    correlation,
+    direction,
+    error,
+    in_standard_errors,
+    number,
+    numbers,
+    probability,
+    uncertainty,
+)
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcal.uncertainty.another_day import NextRecording, Scopes, next_recording
 from triaxcal.uncertainty.statements import Basis, UnmodelledTemperature
 from triaxcal.units import ErrorUnit, grouped, in_units_of
-from triaxcal.inputs.attitude import AttitudeFit
-from triaxcal.inputs.datasheet import Refinement
-from triaxcal.inputs.turning.rotation import RotationFit
-from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
-
 
 Document = dict[str, Any]
-LINEAR = ("scale_factor", "misalignment", "bias")
+GROUPS = ("scale_factor", "misalignment", "bias")
 WEIGHT = "weight"
 """Beside the coefficients of an effect, where predictions average models: by
 which share they count."""
@@ -117,7 +138,7 @@ def calibration_document(
             | ({WEIGHT: chance(c.weights[effect.name])} if effect.name in c.weights else {})
             for effect, _ in c.sensor.effects
         },
-        "standard_error": {name: group(name) for name in LINEAR},
+        "standard_error": {name: group(name) for name in GROUPS},
         "parameters": list(c.parameters),
         "correlation": correlation(c.covariance),
         **({} if c.unmodelled is None else {"unmodelled": _unmodelled(c.unmodelled)}),
@@ -220,7 +241,7 @@ def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
     """Values in the order of `Calibration.parameters`, in groups as the
     coefficients stand in a document."""
     held = dict(zip(c.parameters, values, strict=True))
-    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
+    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in GROUPS}
     effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
     return groups | ({"effects": effects} if effects else {})
 
@@ -270,6 +291,7 @@ def assumed_in(basis: Basis) -> tuple[str, ...]:
 
 # Documents of calibrations by other methods than still poses of unknown attitude.
 
+
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
     document = calibration_document(
         found.calibration, output_unit=output_unit, reference_unit=reference_unit, budgeted=False
@@ -296,7 +318,7 @@ def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: 
         "rotation": numbers(found.rotation),
         "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
         "standard_error_if_exact": {
-            name: numbers(found.noise_error[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(LINEAR)
+            name: numbers(found.noise_error[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(GROUPS)
         },
         "rows": [
             {
@@ -317,9 +339,9 @@ def _if_estimated(found: AttitudeFit) -> Document:
     return {
         "error_rad": uncertainty(found.attitude_error_rad),
         "error_standard_error_rad": uncertainty(found.attitude_error_uncertainty_rad),
-        **{name: numbers(getattr(c.sensor, name)) for name in LINEAR},
+        **{name: numbers(getattr(c.sensor, name)) for name in GROUPS},
         "standard_error": {
-            name: numbers(c.standard_errors[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(LINEAR)
+            name: numbers(c.standard_errors[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(GROUPS)
         },
         "rotation": numbers(found.rotation),
         "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),

@@ -1,30 +1,28 @@
-"""The sensor that a document holds, of whoever wrote it: read with errors that
-name the file and the field."""
+"""A calibration document of any writer as values: the sensor, its errors, and what is
+known of the unit before a later recording. Errors name the file and the field.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
+
 import numpy as np
+
 from triaxcal.arrays import Floats
-from triaxcal.effects import Effect, effect_of
+from triaxcal.effects import TEMPERATURE, Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.calibration import Calibration, ReferenceEpoch, Residual, Unmodelled
-from triaxcal.interchange.calibration_document import WEIGHT
+from triaxcal.estimate.calibration import Calibration, Origin, ReferenceEpoch, Residual, Unmodelled
+from triaxcal.inputs.bias_update import Earlier
+from triaxcal.interchange.calibration_document import GROUPS, WEIGHT
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import LINEAR, Sensor
-from triaxcal.units import reference_unit_of
-from collections.abc import Mapping
-from dataclasses import replace
-from triaxcal.effects import TEMPERATURE
-from triaxcal.estimate.calibration import Origin
-from triaxcal.inputs.bias_update import Earlier
-from triaxcal.model.sensor import LINEAR
 from triaxcal.uncertainty.another_day import Source
-
+from triaxcal.units import reference_unit_of
 
 # The errors of a calibration as its document holds them: standard errors, and how
 # they go together.
@@ -39,7 +37,7 @@ def linear_errors_of(part: Mapping[str, Any], *, where: str) -> Floats:
     InvalidData."""
     held = part.get("standard_error")
     out = []
-    for name in LINEAR:
+    for name in GROUPS:
         values = _numbers(held.get(name) if isinstance(held, Mapping) else None)
         if values.shape != (3,) or not np.all(values >= 0):
             raise InvalidData(f"{where}: standard_error.{name}: expected three numbers of at least 0")
@@ -68,7 +66,7 @@ def correlation_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Fl
     """
     if "correlation" not in part:
         return None
-    expected = [f"{name}.{axis}" for name in LINEAR for axis in "xyz"]
+    expected = [f"{name}.{axis}" for name in GROUPS for axis in "xyz"]
     expected += [f"{effect.name}.{k.name}" for effect, _ in sensor.effects for k in effect.coefficients]
     names = part.get("parameters", expected)
     if not isinstance(names, list) or sorted(map(str, names)) != sorted(expected):
@@ -303,13 +301,14 @@ def _in_budget(budget: Mapping[str, Any], key: str, parameter: str) -> float | N
     group, _, name = parameter.rpartition(".")
     try:
         of = budget[key]
-        return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
+        return float(of[group]["xyz".index(name)] if group in GROUPS else of["effects"][group][name])
     except (LookupError, TypeError, ValueError):
         return None
 
 
 # A calibration document as what is known of a unit before a later recording
 # (`triaxcal.inputs.bias_update`).
+
 
 def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Earlier:
     """Of a calibration, loop or certificate document. Its covariance has what
