@@ -19,7 +19,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
-from triaxcal.estimate.poses_from_means import poses_of_means
+from triaxcal.estimate.pose_fit import poses_of_means
 from triaxcal.evidence.partial_residuals import Trace
 from triaxcal.evidence.posterior import Unexplained
 from triaxcal.inputs.bias_update import updated_biases
@@ -31,7 +31,7 @@ from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import disturbances
 from triaxcal.text import diagnosis
-from triaxcal.uncertainty.another_day import NextRecording, next_recording
+from triaxcal.uncertainty.combined import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
 
 if TYPE_CHECKING:

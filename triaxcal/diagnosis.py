@@ -31,7 +31,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import START_TO_START, NextRecording, next_recording
+from triaxcal.uncertainty.combined import START_TO_START, NextRecording, next_recording
 
 SHOWN = 2
 """Effects that are only corrected on average, at most, in `Loop.traces`: more

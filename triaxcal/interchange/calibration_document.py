@@ -22,7 +22,7 @@ from triaxcal.estimate.calibration import (
 )
 from triaxcal.inputs.attitude import AttitudeFit
 from triaxcal.inputs.datasheet import Refinement
-from triaxcal.inputs.turning.rotation import RotationFit
+from triaxcal.inputs.rotation import RotationFit
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -37,7 +37,7 @@ from triaxcal.rounding import (
     uncertainty,
 )
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcal.uncertainty.another_day import NextRecording, Scopes, next_recording
+from triaxcal.uncertainty.combined import NextRecording, Scopes, next_recording
 from triaxcal.uncertainty.statements import Basis, UnmodelledTemperature
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 

@@ -21,7 +21,7 @@ from triaxcal.inputs.bias_update import Earlier
 from triaxcal.interchange.calibration_document import GROUPS, WEIGHT
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import LINEAR, Sensor
-from triaxcal.uncertainty.another_day import Source
+from triaxcal.uncertainty.combined import Source
 from triaxcal.units import reference_unit_of
 
 # The errors of a calibration as its document holds them: standard errors, and how

@@ -34,10 +34,10 @@ from triaxcal.planning.design import (
     TargetEffects,
     channels_needed,
     combinations,
+    profile,
     profile_times,
     target_effects,
 )
-from triaxcal.planning.optimal_plan import profile
 from triaxcal.poses.covariates import channels_of
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, within_pose_dof
 from triaxcal.poses.pose import Pose

@@ -32,7 +32,7 @@ from triaxcal.schema import AnotherUnit, Calibration, Finding, HeldOut, Loop, Mo
 from triaxcal.schema.calibration import FittedPose, HoldsAt, NextRecording
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
-from triaxcal.uncertainty.another_day import Source
+from triaxcal.uncertainty.combined import Source
 
 UNIT = Sensor(np.array([-2.41, 2.40, -2.37]), np.array([6e-3, 4e-3, -1e-3]), np.array([5e-3, -3e-3, 4e-3]))
 SIGNS = (-1, 1, -1)

@@ -18,7 +18,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import NextRecording, Scopes, Source, next_recording
+from triaxcal.uncertainty.combined import NextRecording, Scopes, Source, next_recording
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
