@@ -59,26 +59,25 @@ CATALOGUE: tuple[Effect, ...] = (
     TemperatureLag(),
     Remanence(),
 )
-"""Those that need no channel but the temperature."""
+"""Our own effects that need no channel, or temperature alone."""
 
 
 # Effects of other packages: entry points of the group ``triaxcal.effects``, each an
-# `Effect` or a class that makes one without arguments.
+# `Effect` or a class that returns one without arguments.
 
 GROUP = "triaxcal.effects"
 LINEAR = "linear"
-"""What documents call the nine parameters, among the names of effects."""
+"""The name of the nine parameters in documents, among the names of effects."""
 UNKNOWN = "another package"
-"""What a package is called that does not say its name."""
+"""The name of a package without metadata."""
 LARGEST = 1e100
-"""Squares of what an effect adds have to be numbers too."""
+"""Limit of an effect's contribution: its square must be a finite number, too."""
 
 T = TypeVar("T")
 
 
 class EffectFault(InvalidData):
-    """An effect of another ``package`` cannot be used as it is, for this
-    ``reason``."""
+    """An effect of another ``package`` is unusable, for this ``reason``."""
 
     def __init__(self, name: str, package: str, reason: str) -> None:
         super().__init__(f"the effect {name} of {package}: {reason}")
@@ -86,32 +85,32 @@ class EffectFault(InvalidData):
 
 
 @dataclass(frozen=True)
-class Foreign(Wrapped):
-    """An effect of another package. Raises EffectFault, and nothing else, where
-    that fails or gives no numbers."""
+class PluginEffect(Wrapped):
+    """An effect of another package. Raises EffectFault alone, whenever the effect
+    raises or returns no finite numbers."""
 
     package: str = UNKNOWN
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self._array(lambda: self.whole.basis(s, covariates), (len(s), 3, len(self.coefficients)))
+        return self._array(lambda: self.inner.basis(s, covariates), (len(s), 3, len(self.coefficients)))
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self._array(lambda: self.whole.slope(s, covariates), (len(s), 3, 3, len(self.coefficients)))
+        return self._array(lambda: self.inner.slope(s, covariates), (len(s), 3, 3, len(self.coefficients)))
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return tuple(self.whole.needs)
+        return tuple(self.inner.needs)
 
     def advice(self, largest: float, floor: float) -> str:
         try:
-            return str(self._asked(lambda: self.whole.advice(largest, floor)))
+            return str(self._guarded(lambda: self.inner.advice(largest, floor)))
         except EffectFault:  # words only
             return self.remedy
 
     @property
     def meaning(self) -> Meaning | None:
         try:
-            meaning = self._asked(lambda: self.whole.meaning)
+            meaning = self._guarded(lambda: self.inner.meaning)
         except EffectFault:  # words only
             return None
         return meaning if isinstance(meaning, Meaning) else None
@@ -119,53 +118,55 @@ class Foreign(Wrapped):
     @property
     def absent(self) -> str:
         try:
-            return str(self._asked(lambda: self.whole.absent))
+            return str(self._guarded(lambda: self.inner.absent))
         except EffectFault:
             return ""
 
     @property
     def lasting(self) -> bool:
-        return self.whole.lasting
+        return self.inner.lasting
 
     @property
     def forms(self) -> tuple[Effect, ...]:
-        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.forms)))
+        return tuple(PluginEffect(e, self.package) for e in self._guarded(lambda: tuple(self.inner.forms)))
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.variants(covariates))))
+        return tuple(
+            PluginEffect(e, self.package) for e in self._guarded(lambda: tuple(self.inner.variants(covariates)))
+        )
 
     def shaped(self, values: Mapping[str, float]) -> Self:
-        return replace(self, whole=self._asked(lambda: self.whole.shaped(values)))
+        return replace(self, inner=self._guarded(lambda: self.inner.shaped(values)))
 
-    def _array(self, ask: Callable[[], Floats], shape: tuple[int, ...]) -> Floats:
-        got = self._asked(lambda: np.asarray(ask(), dtype=float))
+    def _array(self, call: Callable[[], Floats], shape: tuple[int, ...]) -> Floats:
+        got = self._guarded(lambda: np.asarray(call(), dtype=float))
         if got.shape != shape or not (np.abs(got) < LARGEST).all():
             seen = f"{got.shape}" if got.shape != shape else "infinite ones or none"
             raise EffectFault(self.name, self.package, f"expected finite numbers of shape {shape}, not {seen}")
         return got
 
-    def _asked(self, ask: Callable[[], T]) -> T:
+    def _guarded(self, call: Callable[[], T]) -> T:
         try:
-            with np.errstate(all="ignore"):  # what comes of it is looked at
-                return ask()
-        except Exception as e:  # whatever somebody else's code raises is the reason that is reported
+            with np.errstate(all="ignore"):  # `_array` checks the result
+                return call()
+        except Exception as e:  # code of another package may raise anything
             raise EffectFault(self.name, self.package, _reason(e)) from e
 
 
-def is_foreign(effect: Effect) -> bool:
-    """Whether an effect is another package's, in whatever guise."""
-    while isinstance(effect, Wrapped) and not isinstance(effect, Foreign):
-        effect = effect.whole
-    return isinstance(effect, Foreign)
+def is_plugin(effect: Effect) -> bool:
+    """Whether an effect is another package's, also inside wrappers."""
+    while isinstance(effect, Wrapped) and not isinstance(effect, PluginEffect):
+        effect = effect.inner
+    return isinstance(effect, PluginEffect)
 
 
 @cache
 def plugins() -> tuple[tuple[Effect, ...], tuple[tuple[str, str], ...]]:
-    """The effects found, and (name, reason) of those that are broken."""
+    """The usable effects of other packages, and (name, reason) of the broken ones."""
     found: dict[str, Effect] = {}
     broken = []
     for point in sorted(entry_points(group=GROUP), key=lambda p: (p.name, p.value)):
-        effect, why = _loaded(point, found)
+        effect, why = _load(point, found)
         if effect is None:
             broken.append((point.name, why))
         else:
@@ -173,26 +174,26 @@ def plugins() -> tuple[tuple[Effect, ...], tuple[tuple[str, str], ...]]:
     return tuple(found.values()), tuple(broken)
 
 
-def _loaded(point: EntryPoint, others: Collection[str]) -> tuple[Effect | None, str]:
+def _load(point: EntryPoint, others: Collection[str]) -> tuple[Effect | None, str]:
+    """The effect of an entry point, or None and the reason."""
     try:
-        thing = point.load()
-        effect: Any = thing() if isinstance(thing, type) else thing
+        target = point.load()
+        effect: Any = target() if isinstance(target, type) else target
         _check(effect)
-        _try(Foreign(effect, _package(point)))
+        _try_out(PluginEffect(effect, _package(point)))
         if effect.name in others:
             raise ValueError(f"the name {effect.name} is taken by another effect of another package")
     except EffectFault as e:
         return None, e.reason
-    except Exception as e:  # noqa: BLE001 - whatever somebody else's code raises is the reason that is reported
+    except Exception as e:  # noqa: BLE001 - code of another package may raise anything
         return None, _reason(e)
-    return Foreign(effect, _package(point)), ""
+    return PluginEffect(effect, _package(point)), ""
 
 
 def package_of(name: str) -> str:
-    """The package that an effect is of, or an entry point that is broken, by
-    its name."""
+    """The package of an effect, or of a broken entry point, by its name."""
     effect = next((e for e in plugins()[0] if e.name == name), None)
-    if isinstance(effect, Foreign):
+    if isinstance(effect, PluginEffect):
         return effect.package
     point = next((p for p in entry_points(group=GROUP) if p.name == name), None)
     return _package(point) if point else UNKNOWN
@@ -203,7 +204,7 @@ def _package(point: EntryPoint) -> str:
 
 
 def _check(effect: Any) -> None:
-    """Raises whatever keeps what an effect says of itself from being used."""
+    """Raises TypeError, ValueError or any other error of an effect's declarations."""
     if not (isinstance(effect.name, str) and effect.name and effect.coefficients and isinstance(effect.remedy, str)):
         raise TypeError("an effect has a name, coefficients and a remedy")
     if effect.name in (LINEAR, *(e.name for e in (*CATALOGUE, Empirical(), *BETWEEN_RUNS))):
@@ -217,9 +218,8 @@ def _check(effect: Any) -> None:
         raise TypeError(f"needs: expected a tuple of names, not {effect.needs!r}")
 
 
-def _try(effect: Foreign) -> None:
-    """Raises EffectFault where an effect cannot be reckoned with, in a
-    recording or at its reference."""
+def _try_out(effect: PluginEffect) -> None:
+    """Evaluates an effect in a recording and at its reference. Raises EffectFault."""
     n = 4
     names = {*DERIVED, *effect.needs}
     recorded = {name: np.linspace(0.5, 1.5, n) for name in names}

@@ -102,7 +102,7 @@ def fit_with_estimable(
 def _shaped(problem: Problem, state: State, effect: Effect) -> Effect:
     if not isinstance(effect, OnPlansClock):
         return effect
-    variants = effect.whole.variants(problem.covariates)
+    variants = effect.inner.variants(problem.covariates)
     return min(variants, key=lambda e: residual_chi2(linearise(problem, state.extended([e]))))
 
 

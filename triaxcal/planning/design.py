@@ -175,16 +175,16 @@ pose, so that a step usually falls between poses."""
 
 @dataclass(frozen=True)
 class OnPlansClock(Wrapped):
-    """``whole`` with a shape for a recording two units long, by `PLANS_CLOCK`, or
+    """``inner`` with a shape for a recording two units long, by `PLANS_CLOCK`, or
     `TIME` where that is one."""
 
     needs: tuple[str, ...] = (TIME,)
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.basis(s, _clocks(_plans(covariates)))
+        return self.inner.basis(s, _clocks(_plans(covariates)))
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.slope(s, _clocks(_plans(covariates)))
+        return self.inner.slope(s, _clocks(_plans(covariates)))
 
 
 def in_plan(effect: Effect) -> Effect:
