@@ -1,5 +1,5 @@
-"""How values look to others: JSON documents written and read, and samples as
-arrays or tables."""
+"""Values in the formats of other programs: JSON documents, written and read, and
+samples as arrays or tables."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
 
 _LATER = ("agreement_document", "with_recordings")
-"""They import the diagnosis, which most commands do without."""
+"""They import the diagnosis, which most commands do not need."""
 
 __all__ = [
     "WEIGHT",

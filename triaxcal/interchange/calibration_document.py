@@ -44,13 +44,13 @@ from triaxcal.units import ErrorUnit, grouped, in_units_of
 Document = dict[str, Any]
 GROUPS = ("scale_factor", "misalignment", "bias")
 WEIGHT = "weight"
-"""Beside the coefficients of an effect, where predictions average models: by
-which share they count."""
+"""The key of an effect's weight in a model average, next to its coefficients."""
 _LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
-"""As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
+"""The values of documents of 0.1, next to ``excluded``; else the name of the fault."""
 
 
 def poses_document(poses: Sequence[Pose]) -> Document:
+    """`triaxcal.poses/1`."""
     return {
         "format": "triaxcal.poses/1",
         "poses": [
@@ -68,6 +68,7 @@ def poses_document(poses: Sequence[Pose]) -> Document:
 
 
 def residual_document(residual: Residual, reference: float = 1.0) -> Document:
+    """The residual block, rounded for the magnitude of the reference."""
     return {
         "rms_g": error(residual.rms_g, reference),
         "max_abs_g": error(residual.max_abs_g, reference),
@@ -80,7 +81,7 @@ def residual_document(residual: Residual, reference: float = 1.0) -> Document:
 
 
 def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, str]], reference_unit: str) -> Document:
-    """Of one effect; null for a standard error that the poses do not tell."""
+    """The coefficients of one effect; null for an undetermined standard error."""
     return {
         name: {
             "value": number(value),
@@ -92,8 +93,8 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
 
 
 def holds_of(c: Calibration) -> list[str]:
-    """In words, under which conditions scale factor, misalignment and bias are
-    all of a reading; none where always."""
+    """The conditions, in words, under which scale factor, misalignment and bias are the
+    whole model; empty without effects."""
     several = any(p.pose.run.of > 1 for p in c.poses)
     return list(text.holds([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
 
@@ -106,18 +107,19 @@ def calibration_document(
     stated: Stated | None = None,
     budgeted: bool = True,
 ) -> Document:
-    """``reference_unit`` names the unit of the reference vector; keys keep
-    their ``_g`` whatever it is. ``stated`` are uncertainties that no recording
-    can tell. ``budgeted``: with the budget, which is that of a fit to still
-    poses."""
+    """`triaxcal.calibration/1`.
+
+    ``reference_unit`` names the unit of the reference vector; keys keep their ``_g``
+    in any unit. ``stated`` has uncertainties that no recording shows. ``budgeted`` adds
+    the budget, which exists for a fit to still poses."""
     errors = dict(zip(c.parameters, c.standard_errors, strict=True))
     evaluated = budget(c, stated) if budgeted else None
 
     def group(name: str) -> list[Any]:
         return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
 
-    def linear_only(of: Calibration) -> Document:
-        return calibration_document(of, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
+    def linear_only(linear: Calibration) -> Document:
+        return calibration_document(linear, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
 
     return {
         "format": "triaxcal.calibration/1",
@@ -212,13 +214,13 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
 
 
 def _scopes(c: Calibration, evaluated: Budget) -> Document:
-    """Of |a|, by the readings that it is of."""
+    """Expanded uncertainties of |a|, by the readings for which they hold."""
     scopes = Scopes.of(c, evaluated, next_recording(c, evaluated))
     return {name.replace("'", "").replace(" ", "_"): uncertainty(value) for name, value in scopes.named.items()}
 
 
 def _unmodelled(part: Unmodelled) -> Document:
-    """Beside the standard errors and their correlation."""
+    """Uncertainty in addition to the standard errors and their correlation."""
     return {"along_g": uncertainty(part.along), "across_g": uncertainty(part.across)}
 
 
@@ -238,30 +240,29 @@ def next_recording_document(following: NextRecording) -> Document:
 
 
 def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
-    """Values in the order of `Calibration.parameters`, in groups as the
-    coefficients stand in a document."""
-    held = dict(zip(c.parameters, values, strict=True))
-    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in GROUPS}
-    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+    """Values in the order of `Calibration.parameters`, in the groups of a document."""
+    by_name = dict(zip(c.parameters, values, strict=True))
+    groups: Document = {name: [by_name[f"{name}.{axis}"] for axis in "xyz"] for name in GROUPS}
+    effects = {e.name: {k.name: by_name[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
     return groups | ({"effects": effects} if effects else {})
 
 
 def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Document:
-    """Expanded uncertainties and where they come from. Standard uncertainties
-    in the budget's lines."""
+    """Expanded uncertainties and their components; the lines of the budget have
+    standard uncertainties."""
 
     def by_name(values: Floats) -> Document:
         return by_parameter(c, [uncertainty(float(v)) for v in values])
 
-    whole, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
+    magnitude, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
     return {
         "level": b.parameters.level,
         "expanded": by_name(b.parameters.expanded),
         "coverage_factor": by_name(b.parameters.coverage),
         "magnitude": {
-            "standard_g": uncertainty(float(whole.standard)),
-            "coverage_factor": uncertainty(float(whole.coverage)),
-            "expanded_g": uncertainty(float(whole.expanded)),
+            "standard_g": uncertainty(float(magnitude.standard)),
+            "coverage_factor": uncertainty(float(magnitude.coverage)),
+            "expanded_g": uncertainty(float(magnitude.expanded)),
         },
         "budget": [
             {
@@ -284,8 +285,8 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
 
 
 def assumed_in(basis: Basis) -> tuple[str, ...]:
-    """The effects whose size a line of the budget
-    (`triaxcal.uncertainty.Component`) assumes."""
+    """The effects with an assumed size in a component of the budget
+    (`triaxcal.uncertainty.Component`)."""
     return basis.effects if isinstance(basis, UnmodelledTemperature) and not basis.stated else ()
 
 
@@ -293,6 +294,7 @@ def assumed_in(basis: Basis) -> tuple[str, ...]:
 
 
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
+    """A calibration from a turning unit."""
     document = calibration_document(
         found.calibration, output_unit=output_unit, reference_unit=reference_unit, budgeted=False
     )
@@ -308,6 +310,7 @@ def turning_document(found: RotationFit, *, output_unit: str, reference_unit: st
 
 
 def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: str) -> Document:
+    """A calibration from known attitudes."""
     c = found.calibration
     document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
     document["attitudes"] = {
@@ -350,6 +353,7 @@ def _if_estimated(found: AttitudeFit) -> Document:
 
 
 def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:
+    """A refinement of datasheet values."""
     c = found.calibration
     document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
     document["passport"] = {
