@@ -1,8 +1,8 @@
-"""What acts beyond the linear model, with which probability: one evidence for
-effects, outliers and what has no name.
+"""The posterior of all departures from the linear model: one evidence for effects,
+outliers and unmodelled parts.
 
-`triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it
-against what went before.
+`triaxcal.diagnosis` draws the conclusions; `benchmarks.frozen` compares them with
+those of earlier versions.
 """
 
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal

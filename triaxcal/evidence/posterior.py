@@ -330,9 +330,10 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class Findings:
-    """``candidates`` are likely names that are not certain, with their probabilities;
-    ``nothing`` is the probability of no effect, no outlier and no unmodelled part.
-    ``outliers`` are indices among all given poses, each with its probability."""
+    """The conclusions from a posterior. ``candidates`` are likely names that are not
+    certain, with their probabilities; ``nothing`` is the probability of no effect, no
+    outlier and no unmodelled part. ``outliers`` are indices among all given poses,
+    each with its probability."""
 
     named: tuple[Named, ...]
     candidates: Mapping[str, float]
@@ -343,23 +344,25 @@ class Findings:
 
 
 def stated(found: Findings, probabilities: Mapping[str, float]) -> dict[str, float | None]:
-    """Each of these ``probabilities`` of names, or None where it is not calibrated.
-    The prior assumes that the truth is in the catalogue; where it is not, a likely
-    name that is not certain is wrong (`benchmarks.components`)."""
+    """The ``probabilities`` of names, None for those that are not calibrated. The prior
+    assumes that the catalogue contains the truth. If it does not, a likely but
+    uncertain name is wrong (`benchmarks.components`)."""
     known = {named.effect for named in found.named if named.unique}
     least = Odds().reported
     return {name: p if name in known or not reaches(p, least) else None for name, p in probabilities.items()}
 
 
 def findings(posterior: Posterior) -> Findings:
+    """The findings of a posterior, by the thresholds of its `Odds`."""
     odds = posterior.evidence.odds
     certain = {name for group in posterior.certain for name in group}
     places = posterior.evidence.rows.places
     outliers = {
         int(places[i]): float(p) for i, p in enumerate(posterior.outlier_probabilities) if reaches(p, odds.reported)
     }
-    another = int(places[int(np.argmax(posterior.change_point_probabilities))])
-    from_there_on = float(posterior.change_point_probabilities.sum())
+    # A change at any pose; the likeliest pose stands for all.
+    change_pose = int(places[int(np.argmax(posterior.change_point_probabilities))])
+    change_probability = float(posterior.change_point_probabilities.sum())
     return Findings(
         named=tuple(
             Named({name: posterior.effect_probabilities[name] for name in group}, posterior.any_of(group))
@@ -370,12 +373,15 @@ def findings(posterior: Posterior) -> Findings:
         },
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
         unexplained=_unexplained(posterior),
-        change_point=ChangePoint(another, from_there_on) if reaches(from_there_on, odds.reported) else None,
+        change_point=(
+            ChangePoint(change_pose, change_probability) if reaches(change_probability, odds.reported) else None
+        ),
         nothing=_nothing(posterior),
     )
 
 
 def _unexplained(posterior: Posterior) -> Unexplained:
+    """The unmodelled part, with its mean variance over the poses."""
     rows, total = posterior.evidence.rows, posterior.unmodelled_probability
     variance = 0.0
     for p, part in zip(posterior.part_probabilities, posterior.evidence.parts, strict=True):
@@ -398,33 +404,36 @@ def _nothing(posterior: Posterior) -> float:
     return float(weight * empty.part_probabilities[empty.parts.index(0)])
 
 
-# Which effects poses cannot show in full, and why.
+# Effects that the poses cannot show in full, with the reasons.
 
 SAME = 0.1
-"""Of the largest combination of coefficients all over the sphere: two that
-differ in |a| by less do so by the misalignments of the axes, and look the same."""
+"""Share of the largest combination of coefficients over the sphere. Combinations with a
+smaller contribution to |a| differ by the misalignments of the axes alone, and are
+equivalent."""
 
 
 class Why(StrEnum):
+    """The reason why poses do not show an effect."""
+
     NOT_LOGGED = "not_logged"
     SOMETIMES_LOGGED = "sometimes_logged"
     """The channel is missing in some poses."""
     RATE_UNKNOWN = "rate_unknown"
     NOT_KNOWN = "not_known"
-    """A covariate that follows from the poses does not here."""
+    """These poses do not give a derived covariate."""
     STOOD_STILL = "stood_still"
     EVEN_RATE = "even_rate"
     """The channel changes no faster in one pose than in another."""
     EVEN_SCATTER = "even_scatter"
     MOVED_ALONG = "moved_along"
-    """Too few poses, or what the effect goes with moved along with their
-    directions."""
+    """Too few poses, or the covariate changed together with their directions."""
     FEW_DIRECTIONS = "few_directions"
 
 
 @dataclass(frozen=True)
 class NotIdentifiable:
-    """``channel`` is empty where no channel is the reason."""
+    """The reason why poses do not show an effect; ``channel`` is empty if it is not a
+    channel."""
 
     why: Why
     channel: str = ""
