@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
-from triaxcald.recording.contents import Contents
+from triaxcald.recording.reader import Contents
 from triaxcald.recording.schema import BUS_PHASE, BUS_RECORD, RAW
 
 Channel = str | int | None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording.bus import Channel, channel_of, phase_of
-from triaxcald.recording.contents import Contents
+from triaxcald.recording.reader import Contents
 
 # As plain numbers: an IntFlag takes longer than all else that is done to a message.
 _EXTENDED, _REMOTE, _ERROR, _FD = (

@@ -40,9 +40,8 @@ from triaxcald.recording.mcap_records import (
     unparsed_at,
     written_to,
 )
-from triaxcald.recording.raw_batch import decode_raw
-from triaxcald.recording.reader import Recording
-from triaxcald.recording.series import digest_of
+from triaxcald.recording.reader import Recording, digest_of
+from triaxcald.recording.schema import decode_raw
 
 _KEPT = ".replaced"
 _FOOTER_BYTES = 20  # of the body of a footer record

@@ -41,7 +41,7 @@ from triaxcald.recording.mcap_records import (
     unparsed_at,
     whole_chunk_head,
 )
-from triaxcald.recording.raw_batch import decode_raw
+from triaxcald.recording.schema import decode_raw
 
 # What can still be found in a damaged file: its readable records in order and the
 # stretches between them.

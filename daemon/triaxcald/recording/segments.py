@@ -21,14 +21,12 @@ import triaxcal_drivers as td
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
-from triaxcald.recording.file import Head, RecordingFile, ended_because
-from triaxcald.recording.manifest import Manifest, Segment, manifest_path
+from triaxcald.recording.manifest import SEGMENT_BYTES as SEGMENT_BYTES
+from triaxcald.recording.manifest import SEGMENT_S as SEGMENT_S
+from triaxcald.recording.manifest import Document, Manifest, Retention, Segment, Surplus, delete, manifest_path, surplus
+from triaxcald.recording.reader import digest_of
 from triaxcald.recording.rebuild import open_manifest, settled
-from triaxcald.recording.retention import SEGMENT_BYTES as SEGMENT_BYTES
-from triaxcald.recording.retention import SEGMENT_S as SEGMENT_S
-from triaxcald.recording.retention import Document, Retention, Surplus, delete, surplus
-from triaxcald.recording.series import digest_of
-from triaxcald.recording.writer import RecordingWriter
+from triaxcald.recording.writer import Head, RecordingFile, RecordingWriter, ended_because
 
 # Which segments are kept because an outcome or a certificate beside them rests on
 # them: an index of those documents, each of which is read once.

@@ -25,10 +25,10 @@ from mcap.records import (
 )
 
 from triaxcald.recording import schema
+from triaxcald.recording.manifest import Inventory
 from triaxcald.recording.mcap_records import HEAD, UnparsedRecord, chunk_data, chunk_records, parse, whole_chunk_head
-from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.retention import Inventory
+from triaxcald.recording.schema import decode_raw
 
 Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
 AFTER_THE_END = (schema.RAW_RECORD, schema.END_RECORD, schema.RECOVERY_RECORD)
