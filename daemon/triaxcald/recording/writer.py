@@ -504,8 +504,8 @@ class RecordingWriter:
         if self._provisional:
             return None
         if self._thread.is_alive():
-            return AbortNotice(f"{self._told} is not finished; triaxcal log recover mends it")
-        return AbortNotice(str(self._failure) if self._failure else f"{self._told} is finished")
+            return AbortNotice(f"{self._reported_path} is not finished; triaxcal log recover mends it")
+        return AbortNotice(str(self._failure) if self._failure else f"{self._reported_path} is finished")
 
     def __enter__(self) -> Self:
         return self
@@ -521,7 +521,7 @@ class RecordingWriter:
             value.add_note(str(e))  # the current error has priority
 
     @property
-    def _told(self) -> Path:
+    def _reported_path(self) -> Path:
         """The file named in messages."""
         return self.path
 
@@ -565,13 +565,13 @@ class RecordingWriter:
             self._report_losses()
             self._finish()
         except OSError as e:
-            self._failure = disk.not_written(self._told, e, self._sound_ns)
+            self._failure = disk.not_written(self._reported_path, e, self._sound_ns)
         except RecordingError as e:
             self._failure = e
         except Exception as e:
             if not ran_out_of_memory(e):
                 raise
-            self._failure = disk.out_of_memory(self._told, e, self._sound_ns)
+            self._failure = disk.out_of_memory(self._reported_path, e, self._sound_ns)
         finally:
             if self._failure is None and not self._finished:
                 self._failure = RecordingError(f"{self.path}: the writer stopped on a fault of its own")
@@ -616,7 +616,7 @@ class RecordingWriter:
         detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
         self._file.write(schema.EVENTS, schema.Event(self._file.told_ns, ENDED, detail))
         self._finish()
-        raise disk.ended_early(self._told, free, self._sound_ns)
+        raise disk.ended_early(self._reported_path, free, self._sound_ns)
 
     def _make_room(self, job: Callable[[], None]) -> None:
         job()
