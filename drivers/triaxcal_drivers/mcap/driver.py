@@ -1,13 +1,13 @@
 """Sensors whose samples are messages in MCAP files: their profile, the decoder of
-a stream (one sample a message, in the order in which they were logged), and the
-entry point ``mcap``. The one file that imports rosbags.
+a stream (one sample a message, in the order of the log), and the entry point
+``mcap``. The one file that imports rosbags.
 
-The log says how messages are encoded; a recording keeps that beside its profile
+The log tells the encoding of its messages; a recording stores it beside its profile
 (`MessageSchema`). Of two libraries that read definitions of ROS 2 messages,
-mcap-ros2-support refuses capitals in the names of fields, which real packages
-have. rosbags parses; its decoders, which it makes by running generated Python,
-are not used. Of CDR, ROS 2's encoding, only what is asked for is read; the rest
-is stepped over, and nothing is believed that is longer than the message.
+mcap-ros2-support refuses capitals in the names of fields, which real packages have.
+rosbags parses the definitions. Its decoders are not used, as it makes them by running
+generated Python. Of CDR, ROS 2's encoding, this file decodes the requested fields
+alone. It skips all others and accepts no length beyond the message.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from triaxcal_drivers.profile import (
     require_readings,
 )
 
-# The numbers of a stream in its messages, whatever their encoding.
+# Numbers in the messages of a stream, in any encoding.
 
 FORMAT = "triaxcal.messages/1"
-DEFINITION_MOST = 256 * 2**10  # bytes; a sensor's message with all that it is made of has some ten thousand
+DEFINITION_MOST = 256 * 2**10  # bytes; the definition of a sensor's message with all its parts has some ten thousand
 
 
 @dataclass(frozen=True)
 class MessageSchema:
-    """``encoding`` of the messages (cdr, json, protobuf), ``language`` of their
-    definition (ros2msg, ros2idl, protobuf, jsonschema). Where the
-    ``stamp_stands_still``, it is no time."""
+    """``encoding`` of the messages (cdr, json, protobuf), and ``language`` of their
+    definition (ros2msg, ros2idl, protobuf, jsonschema). A stamp that
+    ``stamp_stands_still`` is no time."""
 
     name: str
     encoding: str
@@ -84,7 +84,7 @@ class MessageSchema:
 
 
 _IDL_PARTS = re.compile(r"^={80}\nIDL: .*\n", re.MULTILINE)
-"""What stands between the files of a definition in IDL (rosbag2)."""
+"""Separator between the files of a definition in IDL (rosbag2)."""
 
 Fields = Sequence[tuple[str, "Described"]]
 Described = tuple[str, Any]
@@ -93,8 +93,8 @@ Described = tuple[str, Any]
 
 
 def message_types(name: str, language: str, definition: bytes, where: str) -> tuple[str, Mapping[str, Fields]]:
-    """The fields of each message by its name, and the name of the outermost
-    one. Raises ProfileError; ModuleNotFoundError without rosbags."""
+    """Name of the outermost message, and the fields of each message by its name. Raises
+    ProfileError; ModuleNotFoundError without rosbags."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
     from rosbags.typesys.base import TypesysError
 
@@ -129,35 +129,36 @@ _FORMATS = {
 }  # fmt: skip
 _SIZES = {name: struct.calcsize(code) for name, code in _FORMATS.items()}
 _ORDERS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}
-"""By the second byte of a message: byte order, and the largest alignment (plain
-CDR of versions 1 and 2)."""
-DEEPEST = 32  # messages within messages; honest ones have three or four
+"""Byte order and largest alignment by the second byte of a message, for plain CDR of
+versions 1 and 2."""
+DEEPEST = 32  # messages within messages; usual ones have three or four
 
-_Wanted = dict[str, Any]  # by field: the place of its number among those asked for, or what is wanted within
+_Requested = dict[str, Any]  # by field: the index of its number among the requested ones, or the requests within it
 
 
 class CdrReader:
-    """Reads the fields at ``paths`` of messages ``outermost``. Raises
-    ProfileError where there is no such number."""
+    """Reads the fields at ``paths`` of messages ``outermost``. The constructor raises
+    ProfileError if a path leads to no number."""
 
     def __init__(self, outermost: str, types: Mapping[str, Fields], paths: Sequence[Sequence[str]], where: str) -> None:
         self._types, self._outermost = types, outermost
         self._count = len(paths)
-        self._wanted: _Wanted = {}
+        self._requested: _Requested = {}
         for place, path in enumerate(paths):
             _number(types, ("message", outermost), path, where)
-            at = self._wanted
+            at = self._requested
             for part in path[:-1]:
                 at = at.setdefault(part, {})
             at[path[-1]] = place
 
     def read(self, data: bytes) -> list[float]:
-        """Raises ValueError where the message is not as it is defined."""
+        """The numbers at the paths. Raises ValueError if the message does not match its
+        definition."""
         if len(data) < 4 or data[0] != 0 or data[1] not in _ORDERS:
             raise ValueError("not plain CDR")
         walk = _Walk(self._types, data[4:], *_ORDERS[data[1]], [0.0] * self._count)
         try:
-            walk.field(("message", self._outermost), self._wanted, 0)
+            walk.field(("message", self._outermost), self._requested, 0)
         except struct.error as e:
             raise ValueError("shorter than its definition") from e
         if walk.left:
@@ -166,7 +167,7 @@ class CdrReader:
 
 
 def members(types: Mapping[str, Fields], outermost: str, path: Sequence[str]) -> set[str]:
-    """The fields of the message at ``path``; none where it is no message."""
+    """Names of the fields of the message at ``path``; none if no message is there."""
     at: Described = ("message", outermost)
     for part in path:
         at = dict(types.get(at[1], ())).get(part, ("none", "")) if at[0] == "message" else ("none", "")
@@ -174,6 +175,7 @@ def members(types: Mapping[str, Fields], outermost: str, path: Sequence[str]) ->
 
 
 def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], where: str) -> None:
+    """Raises ProfileError if the path from ``at`` leads to no number."""
     for place, part in enumerate(path):
         kind, detail = at
         if kind == "message":
@@ -193,7 +195,7 @@ def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], whe
 
 
 class _Walk:
-    """One way through one message."""
+    """One pass through one message, up to the last requested field."""
 
     def __init__(
         self, types: Mapping[str, Fields], data: bytes, order: str, alignment: int, found: list[float]
@@ -202,26 +204,26 @@ class _Walk:
         self._at = 0
         self.found, self.left = found, len(found)
 
-    def field(self, described: Described, wanted: Any, depth: int) -> None:
-        """``wanted`` is the place of its number, or a dict of what is wanted
-        within; the walk ends where nothing is left to be found."""
+    def field(self, described: Described, requested: Any, depth: int) -> None:
+        """Reads or skips one field. ``requested`` is the index of its number, or a dict
+        of the requests within it. The walk ends after the last requested number."""
         if not self.left:
             return
         if depth > DEEPEST:
             raise ValueError("nested too deeply")
         kind, detail = described
         if kind == "base":
-            self._base(detail, wanted)
+            self._base(detail, requested)
         elif kind == "message":
             for name, inner in self._types[detail]:
-                self.field(inner, wanted.get(name), depth + 1) if isinstance(wanted, dict) else self.field(
+                self.field(inner, requested.get(name), depth + 1) if isinstance(requested, dict) else self.field(
                     inner, None, depth + 1
                 )
         else:
             element, count = detail if kind == "array" else (detail, self._count())
-            self._elements(element, count, wanted if isinstance(wanted, dict) else {}, depth)
+            self._elements(element, count, requested if isinstance(requested, dict) else {}, depth)
 
-    def _base(self, name: str, wanted: Any) -> None:
+    def _base(self, name: str, requested: Any) -> None:
         if name in ("string", "wstring"):
             length = self._count()
             self._step(length if name == "string" else 2 * length)
@@ -230,21 +232,21 @@ class _Walk:
         if size is None:
             raise ValueError(f"a field of type {name}")
         self._align(size)
-        if isinstance(wanted, int):
-            (self.found[wanted],) = struct.unpack_from(self._order + _FORMATS[name], self._data, self._at)
+        if isinstance(requested, int):
+            (self.found[requested],) = struct.unpack_from(self._order + _FORMATS[name], self._data, self._at)
             self.left -= 1
         self._step(size)
 
-    def _elements(self, element: Described, count: int, wanted: _Wanted, depth: int) -> None:
+    def _elements(self, element: Described, count: int, requested: _Requested, depth: int) -> None:
         size = _SIZES.get(element[1]) if element[0] == "base" else None
-        if size and count and not wanted:
+        if size and count and not requested:
             self._align(size)
             self._step(count * size)
             return
         if count > len(self._data):
             raise ValueError("a sequence that is longer than the message")
         for i in range(count):
-            self.field(element, wanted.get(str(i)), depth + 1)
+            self.field(element, requested.get(str(i)), depth + 1)
 
     def _count(self) -> int:
         self._align(4)
@@ -265,12 +267,12 @@ SECONDS = ("sec", "secs", "seconds")
 NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
 
 Read = Callable[[bytes], tuple[list[float], int | None]]
-"""The numbers asked for, and the time stamp in nanoseconds. Raises
-ValueError."""
+"""The requested numbers, and the time stamp [ns]. Raises ValueError."""
 
 
 def reader(schema: MessageSchema, paths: Sequence[str], time: str | None, where: str) -> Read:
-    """Raises ProfileError; ModuleNotFoundError without rosbags."""
+    """A decoder for the fields at ``paths`` and the time stamp at ``time``. Raises
+    ProfileError; ModuleNotFoundError without rosbags."""
     if len(schema.definition) > DEFINITION_MOST:
         raise ProfileError(f"{where}: a definition of more than {DEFINITION_MOST} bytes")
     split = [path.split(".") for path in paths]
@@ -282,12 +284,13 @@ def reader(schema: MessageSchema, paths: Sequence[str], time: str | None, where:
     if schema.encoding == "protobuf" and schema.language == "protobuf":
         message = _protobuf(schema, where)
         return lambda data: _numbers(_decoded(message, data), split, stamp)
-    told = f"'{schema.encoding}' by {schema.language or 'no definition'}"
-    raise ProfileError(f"{where}: messages encoded as {told}, expected cdr (ros2msg, ros2idl), json or protobuf")
+    encoding = f"'{schema.encoding}' by {schema.language or 'no definition'}"
+    raise ProfileError(f"{where}: messages encoded as {encoding}, expected cdr (ros2msg, ros2idl), json or protobuf")
 
 
 def _cdr(schema: MessageSchema, paths: list[list[str]], stamp: list[str] | None, where: str) -> Read:
     outermost, types = message_types(schema.name, schema.language, schema.definition, where)
+    # The stamp is a message with seconds and nanoseconds, or one number.
     inside = members(types, outermost, stamp) if stamp else set()
     parts = [p for names in (SECONDS, NANOSECONDS) for p in names if p in inside][:2]
     stamps = [[*stamp, part] for part in parts] if stamp and len(parts) == 2 else [stamp] if stamp else []
@@ -295,15 +298,15 @@ def _cdr(schema: MessageSchema, paths: list[list[str]], stamp: list[str] | None,
 
     def numbers(data: bytes) -> tuple[list[float], int | None]:
         found = read(data)
-        told = found[len(paths) :]
-        return found[: len(paths)], _stamp_ns(*told) if told else None
+        stamped = found[len(paths) :]
+        return found[: len(paths)], _stamp_ns(*stamped) if stamped else None
 
     return numbers
 
 
 def _stamp_ns(seconds: float, nanoseconds: float | None = None) -> int:
-    """Of a stamp's two parts; of one number where that is all: a float is
-    seconds, a whole number nanoseconds. Raises ValueError."""
+    """Time [ns] by the two parts of a stamp, or by one number: a float counts seconds,
+    an integer nanoseconds. Raises ValueError."""
     try:
         if nanoseconds is not None:
             time_ns = int(seconds) * 1_000_000_000 + int(nanoseconds)
@@ -350,7 +353,7 @@ def _decoded(message: Any, data: bytes) -> Any:
 
 
 def _numbers(message: Any, paths: list[list[str]], stamp: list[str] | None) -> tuple[list[float], int | None]:
-    """Raises ValueError."""
+    """The numbers at the paths, and the time stamp [ns]. Raises ValueError."""
     found = [_at(message, path) for path in paths]
     if not all(isinstance(value, int | float) for value in found):
         raise ValueError("no number")
@@ -360,10 +363,11 @@ def _numbers(message: Any, paths: list[list[str]], stamp: list[str] | None) -> t
         raise ValueError("a number beyond all measure") from e
     if stamp is None:
         return found, None
-    told = _at(message, stamp)
-    if isinstance(told, int | float):
-        return found, _stamp_ns(told)
-    parts = [next((v for name in names if (v := _inside(told, name)) is not None), None) for names in
+    # The stamp: one number, or a message with seconds and nanoseconds.
+    stamped = _at(message, stamp)
+    if isinstance(stamped, int | float):
+        return found, _stamp_ns(stamped)
+    parts = [next((v for name in names if (v := _inside(stamped, name)) is not None), None) for names in
              (SECONDS, NANOSECONDS)]  # fmt: skip
     if not all(isinstance(part, int | float) for part in parts):
         raise ValueError("no time stamp")
@@ -379,7 +383,7 @@ def _at(message: Any, path: list[str]) -> Any:
 
 
 def _inside(message: Any, part: str) -> Any:
-    """The field, or the element, of that name; None where there is none."""
+    """The field of that name, or the element of that index; None if there is none."""
     if isinstance(message, dict):
         return message.get(part)
     if part.isdecimal():
@@ -452,8 +456,8 @@ class McapProfile(Profile):
 
 
 def schema_file(stream: str) -> str:
-    """The file that says how a stream's messages are encoded; a recording
-    carries it, made from the log."""
+    """Name of the file with the encoding of a stream's messages. The import makes it
+    from the log, and the recording carries it."""
     return f"{stream}.schema.json"
 
 
@@ -464,12 +468,11 @@ class McapBus(Strict):
 class MessageDecoder:
     """Decodes one stream.
 
-    **Time.** That at which the first message was logged, plus the time that has
-    gone by since on its own stamp; where there is none, the time of logging.
+    **Time.** The time of a message is the log time of the first message plus the
+    difference of their stamps; without stamps, its own log time.
 
-    Records of the other streams are passed over: ``source`` is the number of
-    the stream in the profile. A message that is not as it is defined counts as
-    malformed.
+    ``source`` is the number of the stream in the profile. Records of other streams
+    are skipped. A message that does not match its definition counts as malformed.
     """
 
     def __init__(self, stream: MessageStream, read: Read, source: int) -> None:
@@ -478,7 +481,7 @@ class MessageDecoder:
         self._scale = np.array([c.scale for c in stream.channels.values()])
         self._offset = np.array([c.offset for c in stream.channels.values()])
         self._count = 0
-        self._origin_ns: int | None = None  # on the host's clock, less that of the stamp
+        self._origin_ns: int | None = None  # log time less stamp, of the first message
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         times: list[int] = []
@@ -503,7 +506,7 @@ class MessageDecoder:
         return replace(self._block(times, rows), errors=errors, malformed=malformed)
 
     def _time_ns(self, logged_ns: int, stamp_ns: int | None) -> int:
-        """Raises ValueError where the stamps are too far apart."""
+        """Time of a sample [ns]. Raises ValueError if the stamps are too far apart."""
         if stamp_ns is None:
             return logged_ns
         if self._origin_ns is None:
@@ -523,21 +526,20 @@ class MessageDecoder:
 
 
 class McapDriver:
-    """Messages that others logged in MCAP files. There is nothing that could be
-    opened."""
+    """Messages that other programs logged in MCAP files. There is no device to open."""
 
     profile_model = McapProfile
     bus_model = McapBus
 
     def device(self, bundle: Bundle, bus: McapBus) -> Device:
-        """Raises ProfileError: there is none."""
+        """Raises ProfileError, as there is no device."""
         raise ProfileError(
             f"profile {bundle.profile.name}: driver 'mcap' reads logs and no bus: `triaxcal log import` takes them"
         )
 
     def decoder(self, bundle: Bundle, stream: str) -> MessageDecoder:
-        """Raises ProfileError where the messages do not hold what it names, or
-        nothing says how they are encoded."""
+        """Raises ProfileError if the messages lack a field that the profile names, or
+        if their encoding is unknown."""
         profile = cast(McapProfile, bundle.profile)
         where = f"profile {profile.name}"
         if stream not in profile.streams:

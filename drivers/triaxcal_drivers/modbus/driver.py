@@ -77,22 +77,24 @@ class ModbusDecoder:
         return self._senders.are_two(arrival_ns, message, counts, records.astype(np.float64), suspect=bool(faults))
 
     def feed(self, batch: RawBatch) -> SampleBlock:
-        mine = batch.source == self._source
+        # Choose the whole replies to this stream's reads.
+        own = batch.source == self._source
         failed = (batch.flags & (RawFlag.ERROR | RawFlag.INVALID) != 0) | (batch.length != 2 * self._stream.words)
-        good = mine & ~failed
+        good = own & ~failed
         starts = (np.cumsum(batch.length, dtype=np.int64) - batch.length)[good]
         data = np.frombuffer(batch.payload, dtype=np.uint8)
         replies = data[starts[:, None] + np.arange(2 * self._stream.words)]
         if self._swap_bytes:
             replies = replies.reshape(len(replies), -1, 2)[:, :, ::-1].reshape(len(replies), -1)
+        # Count the failures and gaps before each reply.
         host_ns = batch.time_ns[good]
-        errors = np.cumsum(mine & failed)[good]
+        errors = np.cumsum(own & failed)[good]
         gaps = np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
         gaps_before, all_gaps = self._gaps + gaps[good], self._gaps + (int(gaps[-1]) if len(gaps) else 0)
-        total = int((mine & failed).sum())
+        total = int((own & failed).sum())
+        # Divide the windows of a FIFO into records.
         if isinstance(self._stream, FifoStream):
-            # A count past the window is no reply of this device: an error like
-            # any other.
+            # A count beyond the window is an error.
             broken = self._number(replies, self._stream.header.count) > self._stream.record_capacity
             errors, total = errors + np.cumsum(broken), total + int(broken.sum())
             replies, host_ns, errors, gaps_before = (each[~broken] for each in (replies, host_ns, errors, gaps_before))
@@ -107,23 +109,23 @@ class ModbusDecoder:
     def _records(
         self, stream: FifoStream, replies: Bytes, host_ns: NDArray[np.int64]
     ) -> tuple[Bytes, NDArray[np.int64], NDArray[np.int64], NDArray[np.intp]]:
-        """The windows' records one after the other, when each was taken by the
-        host's clock, samples lost before each, and the window each is of."""
+        """Records of all windows in a row, and for each its time by the host's clock
+        [ns], the number of samples lost before it, and the index of its window."""
         count = self._number(replies, stream.header.count)
         inside = np.arange(stream.record_capacity) < count[:, None]
         body = replies[:, 2 * stream.record_start :].reshape(
             len(replies), stream.record_capacity, 2 * stream.record_words
         )
         of, index = np.nonzero(inside)
-        behind = count[of] - 1 - index  # records taken later than this one, in the device at that moment
+        behind = count[of] - 1 - index  # number of later records in the device at that moment
         if stream.header.remaining is not None:
             behind = behind + self._number(replies, stream.header.remaining)[of]
         arrival_ns = host_ns[of] - np.rint(behind * self._period_ns).astype(np.int64)
         return body[inside], arrival_ns, self._skipped(stream, replies, of), of
 
     def _skipped(self, stream: FifoStream, replies: Bytes, of: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Samples lost to overflow between each record and the one before it,
-        by the device's own count."""
+        """Number of samples lost to overflow before each record, by the device's own
+        count."""
         if stream.header.lost is None or not len(replies):
             return np.zeros(len(of), np.int64)
         raw = self._number(replies, stream.header.lost)
@@ -147,10 +149,12 @@ class ModbusDecoder:
         errors: int,
     ) -> SampleBlock:
         stream = self._stream
+        # Failures and gaps since the previous record.
         broken = np.diff(errors_before, prepend=self._errors_at_last) > 0
         after_gap = np.diff(gaps_before, prepend=self._gaps_at_last) > 0
         if len(errors_before):
             self._errors_at_last, self._gaps_at_last = int(errors_before[-1]), int(gaps_before[-1])
+        # Place the records in time by their counters and time stamps.
         counter = (
             self._value(records, stream.counter).astype(np.int64) & (1 << stream.counter.modulus_bits) - 1
             if stream.counter
@@ -167,6 +171,7 @@ class ModbusDecoder:
                 after_gap,
             )
         )
+        # Decode the channels of new records.
         kept = records[placed.new]
         with np.errstate(over="ignore", invalid="ignore"):  # a scale may be any
             values = {
@@ -179,8 +184,8 @@ class ModbusDecoder:
             np.stack([values.pop(name) for name in READING_CHANNELS], axis=1),
             values,
             missing=placed.missing,
-            # A block of the newest sample is read oftener than that changes; a
-            # record comes out of a FIFO once.
+            # Polls read the newest sample more often than it changes. A FIFO yields
+            # each record once.
             duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
             restarts=placed.restarts,
@@ -230,8 +235,8 @@ class ModbusDriver:
         return ModbusDevice(_profile(bundle), bus)
 
     def loads(self, bundle: Bundle, bus: Any) -> Mapping[str, LineLoad]:
-        """By stream; nothing where no baud rate tells how fast the line is:
-        over TCP, and on a pseudo-terminal."""
+        """Load of each stream. None over TCP and on a pseudo-terminal, whose speed no
+        baud rate tells."""
         where = bus.where
         if not isinstance(where, SerialLine) or (port := canonical_port(where.port)).startswith("/dev/pts/"):
             return {}
