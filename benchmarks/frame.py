@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from triaxcal.arrays import Floats
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import AXES, LABELS, nearest_rotation, recognise
-from triaxcal.frames.fixture import SyntheticFixture
 from triaxcal.frames.orientations import Assumed, verticals
 from triaxcal.frames.standing import stand
-from triaxcal.frames.unit_frames import frames
+from triaxcal.frames.unit_frames import SyntheticFixture, frames
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -20,8 +20,8 @@ from mcap.writer import Writer as McapWriter
 
 from benchmarks.fuzz_spoil import spoil, spoil_packed
 from triaxcal.model.directions import directions
-from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.driver import CanDecoder
+from triaxcal_drivers.can.layout import stream_layout
 from triaxcal_drivers.can.model import CanProfile, CanStream, PdoStream
 from triaxcal_drivers.catalogue import BUILT_IN, load_bundle
 from triaxcal_drivers.interface import RawBatch

@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 from benchmarks.table import Table, run
 from benchmarks.truth import information
 from triaxcal.estimate.initial_estimate import closed_form, coefficients
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.inputs.turning.rotation import fit_rotation
+from triaxcal.inputs.moments import Moments
+from triaxcal.inputs.rotation import fit_rotation
 from triaxcal.model.sensor import Sensor
 
 SEEDS, QUICK = 12, 3

@@ -24,7 +24,7 @@ from triaxcal_drivers.catalogue import BUILT_IN, driver_named
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.inputs import bundle_of
-from triaxcald.recording.can_messages import batches_of, messages_of, row_of
+from triaxcald.recording.bus import batches_of, messages_of, row_of
 from triaxcald.recording.python_can import BATCH, RecordingMessageReader, RecordingMessageWriter
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter

@@ -27,11 +27,11 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.inputs.bias_update import SCALE_FACTOR_SHARE, updated_biases
-from triaxcal.model.bias_directions import bias_directions
+from triaxcal.model.directions import bias_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import START_TO_START
+from triaxcal.uncertainty.combined import START_TO_START
 
 COUNTS: tuple[int | None, ...] = (3, 4, 6, None)
 SEEDS, QUICK = 2000, 200

@@ -32,7 +32,7 @@ from triaxcal.pooled_units import PooledEffect, pooled_analysis
 from triaxcal.text.advice import chance
 from triaxcal.text.pooled_units import verdict
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import next_recording
+from triaxcal.uncertainty.combined import next_recording
 
 SHOWN = 6
 """The sensor whose residuals are drawn: that with the largest warm-up."""

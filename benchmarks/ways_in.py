@@ -12,8 +12,8 @@ from benchmarks.truth import information, plan
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.inputs.attitude import fit_attitudes
 from triaxcal.inputs.datasheet import Datasheet, refine
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.inputs.turning.rotation import fit_rotation
+from triaxcal.inputs.moments import Moments
+from triaxcal.inputs.rotation import fit_rotation
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

@@ -9,7 +9,7 @@ from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
 from triaxcal.frames.faces import LABELS
-from triaxcal.frames.fixture import SyntheticFixture
+from triaxcal.frames.unit_frames import SyntheticFixture
 from triaxcal.model.directions import directions
 from triaxcal.model.gravity import STANDARD_GRAVITY
 from triaxcal.model.sensor import Sensor

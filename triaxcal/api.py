@@ -1,5 +1,5 @@
-"""From samples to a calibration, for whoever calls from Python: `import
-triaxcal as tc`."""
+"""The functions of the package, from samples to a calibration: `import triaxcal as
+tc`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
-from triaxcal.estimate.poses_from_means import poses_of_means
-from triaxcal.evidence.findings import Unexplained
+from triaxcal.estimate.pose_fit import poses_of_means
 from triaxcal.evidence.partial_residuals import Trace
+from triaxcal.evidence.posterior import Unexplained
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
@@ -31,7 +31,7 @@ from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import disturbances
 from triaxcal.text import diagnosis
-from triaxcal.uncertainty.another_day import NextRecording, next_recording
+from triaxcal.uncertainty.combined import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
 
 if TYPE_CHECKING:
@@ -39,17 +39,16 @@ if TYPE_CHECKING:
 
 
 class PlannedPose(NamedTuple):
-    """``label`` names the axes that point up ("+X-Y"); ``up`` (3,) is that
-    direction in the sensor's frame."""
+    """A pose of a plan. ``label`` names the axes that point up ("+X-Y"); ``up`` (3,) is
+    that direction in the sensor's frame."""
 
     label: str
     up: tuple[float, float, float]
 
 
 class Poses(tuple[Pose, ...]):
-    """Still poses, in order of time. ``data_quality`` has a line for everything
-    that the raw stream is to be blamed for; ``output_unit`` is what
-    `find_poses` was given."""
+    """Still poses, in order of time. ``data_quality`` has a line for each fault of the
+    raw stream; ``output_unit`` is the argument of `find_poses`."""
 
     data_quality: tuple[str, ...] = ()
     output_unit: str = ""
@@ -67,11 +66,10 @@ class Poses(tuple[Pose, ...]):
         channels: Mapping[str, Any] | None = None,
         time_unit: str | None = None,
     ) -> Poses:
-        """One pose a row, where only means are known: ``u`` (n,3) in output
-        units, ``standard_errors`` (n,3) of them, ``t`` (n,) as in `find_poses`,
-        ``channels`` (n,) each. Without standard errors the noise is estimated
-        from the residuals of the linear model, so that no lack of fit can show.
-        Raises Refused, InvalidData."""
+        """Poses from means alone, one pose a row: ``u`` (n,3) in output units, their
+        ``standard_errors`` (n,3), ``t`` (n,) as in `find_poses`, ``channels`` (n,)
+        each. Without standard errors the residuals of the linear model give the noise,
+        so no lack of fit can show. Raises Refused, InvalidData."""
         readings = tables.readings_of(u)
         if readings.ndim != 2:
             raise InvalidData(f"u: expected shape (n, 3), one row a pose, not {readings.shape}")
@@ -81,8 +79,8 @@ class Poses(tuple[Pose, ...]):
         seconds = None if t is None else tables.seconds(t, time_unit)
         if seconds is not None and len(seconds) != len(readings):
             raise InvalidData(f"t has {len(seconds)} times, and u has {len(readings)} poses")
-        held = {n: tables.channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()}
-        return cls(poses_of_means(readings, seconds, errors, held))
+        values = {n: tables.channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()}
+        return cls(poses_of_means(readings, seconds, errors, values))
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ class Diagnosis:
     likely than not; ``probabilities`` has every effect of the search, None if its
     probability is not calibrated. ``unexplained`` is the unmodelled part,
     ``held_out`` the error in poses that no fit saw, ``advice`` a list of actions,
-    ``notes`` further remarks. ``traces`` are the partial residuals of each finding
+    ``notes`` further notes. ``traces`` are the partial residuals of each finding
     and each candidate, which `plot` draws."""
 
     before: Calibration
@@ -132,9 +130,9 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit
-    of the reference, with their standard errors from noise (n,), and the
-    standard uncertainty of |a| that the calibration leaves there (n,)."""
+    """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit of the
+    reference, with their standard errors from noise (n,), and the standard uncertainty
+    of |a| from the calibration (n,)."""
 
     poses: tuple[Pose, ...]
     error: Floats
@@ -153,12 +151,12 @@ class Verification:
 
     @property
     def expected(self) -> float:
-        """The rms error that noise and the uncertainty of the calibration make."""
+        """The rms error that noise and the uncertainty of the calibration predict."""
         return float(np.sqrt(np.mean(self.standard_error**2 + self.uncertainty**2)))
 
     def summary(self) -> str:
-        judged = number_of(len(self.poses), "pose")
-        return text.verification(judged, self.rms, self.noise_floor, self.expected, self.reference)
+        verified = number_of(len(self.poses), "pose")
+        return text.verification(verified, self.rms, self.noise_floor, self.expected, self.reference)
 
     def __repr__(self) -> str:
         return self.summary()
@@ -175,12 +173,12 @@ def find_poses(
 ) -> Poses:
     """The still spans of a recording, without a threshold.
 
-    ``t`` (n,) floats in seconds, datetimes, or integers with ``time_unit`` (s,
-    ms, us, ns); ``u`` (n,3) output units; ``channels`` (n,) each by name. Or
-    ``t`` a DataFrame with the columns t_s, ux, uy, uz and any further channels;
-    ``columns`` says how they are called where that is otherwise, channels too:
-    {"t": "time", "ux": "ax", …, "temp_c": "Temperatur"}. A file is first read
-    into a DataFrame, by whatever reads it. Raises InvalidData.
+    ``t`` (n,) has floats in seconds, datetimes, or integers with ``time_unit`` (s, ms,
+    us, ns); ``u`` (n,3) is in output units; ``channels`` (n,) each by name. Or ``t`` is
+    a DataFrame with the columns t_s, ux, uy, uz and any further channels. ``columns``
+    gives other names of columns, also of channels: {"t": "time", "ux": "ax", …,
+    "temp_c": "Temperatur"}. The caller reads a file into a DataFrame. Raises
+    InvalidData.
     """
     samples = _samples(t, u, channels, time_unit, columns)
     finder = PoseFinder()
@@ -210,10 +208,10 @@ def calibrate(
 ) -> Calibration:
     """Fit the linear model, and the ``effects`` named, to still poses.
 
-    ``poses`` from `find_poses`; or what that takes. ``signs`` (3,) of the scale
-    factors, which |a| does not show; ``reference`` the magnitude of the
-    reference vector in ``reference_unit``. Raises Refused where the poses
-    cannot carry the parameters, InvalidData.
+    ``poses`` come from `find_poses`, or are its arguments. ``signs`` (3,) are those of
+    the scale factors, which |a| does not show. ``reference`` is the magnitude of the
+    reference vector in ``reference_unit``. Raises Refused if the poses do not
+    determine the parameters, InvalidData.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     names = [effects] if isinstance(effects, str) else list(effects)
@@ -243,11 +241,11 @@ def diagnose(
     reference_unit: str = "g",
     stated: uncertainty.Stated | None = None,
 ) -> Diagnosis:
-    """Find what the poses show beyond the linear model, and add it.
+    """Find the effects that the poses show beyond the linear model, and correct them.
 
-    As `calibrate`; ``check`` are poses of another recording, or a table of its
-    samples, for the held-out error; ``at`` the moment for which effects of time
-    hold elsewhere: "end", "mean", or seconds from the first sample.
+    The arguments are those of `calibrate`. ``check`` has poses of another recording,
+    or a table of its samples, for the hold-out error. ``at`` is the moment for which
+    effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     try:
@@ -258,36 +256,36 @@ def diagnose(
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
     others = None if check is None else _poses(check)
     output_unit = output_unit or _unit_of(poses)
-    closed_loop = diagnosed(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
+    loop = diagnosed(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
-        for c in (closed_loop.before, closed_loop.after)
+        for c in (loop.before, loop.after)
     )
-    small = ErrorUnit.of(reference_unit, closed_loop.after.reference)
-    following = next_recording(closed_loop.after, uncertainty.budget(closed_loop.after, stated))
+    small = ErrorUnit.of(reference_unit, loop.after.reference)
+    following = next_recording(loop.after, uncertainty.budget(loop.after, stated))
     return Diagnosis(
         before,
         after,
-        closed_loop.call,
-        closed_loop.findings,
-        closed_loop.candidates,
-        closed_loop.stated,
-        closed_loop.found.unexplained,
+        loop.call,
+        loop.findings,
+        loop.candidates,
+        loop.stated,
+        loop.found.unexplained,
         following,
-        closed_loop.held_out,
-        tuple(diagnosis.advice(closed_loop, small)),
-        tuple(diagnosis.notes(closed_loop, small)),
-        closed_loop.traces,
-        diagnosis.lines(closed_loop, small, following, stated),
+        loop.held_out,
+        tuple(diagnosis.advice(loop, small)),
+        tuple(diagnosis.notes(loop, small)),
+        loop.traces,
+        diagnosis.lines(loop, small, following, stated),
     )
 
 
 def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> Verification:
-    """The errors of the magnitude in still poses of another recording, as
-    `find_poses` gives them or takes samples.
+    """The errors of the magnitude in still poses of another recording. ``poses`` come
+    from `find_poses`, or are its arguments.
 
-    Poses whose samples have a fault are excluded. Raises Refused where none is
-    left, InvalidData.
+    Poses with faulty samples are excluded. Raises Refused if none is left,
+    InvalidData.
     """
     found = [p for p in _poses(poses, u, **how) if not p.fault]
     if not found:
@@ -305,13 +303,13 @@ def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> V
 
 
 def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | None = None, **how: Any) -> Calibration:
-    """The calibration with three biases anew, by still poses of a later
-    recording: scale factors, misalignments and effects are kept.
+    """The calibration with three new biases from still poses of a later recording.
+    Scale factors, misalignments and effects are kept.
 
-    ``poses`` from `find_poses`, or what that takes; only the ``first`` so many
-    that are 45° apart (10° if there are fewer), or all. The uncertainty contains
-    that of the calibration, the change from recording to recording, and that of
-    the poses. Raises Refused if these do not determine three biases, or if the
+    ``poses`` come from `find_poses`, or are its arguments. ``first`` limits them to
+    the first so many that are 45° apart (10° if there are fewer). The uncertainty
+    contains that of the calibration, the change from recording to recording, and that
+    of the poses. Raises Refused if these do not determine three biases, or if the
     kept parameters no longer fit; InvalidData.
     """
     if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
@@ -326,15 +324,15 @@ def rezero(calibration: Calibration, poses: Any, u: Any = None, *, first: int | 
 
 
 def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
-    """Directions for the unit, in an order that separates attitude from time,
-    with the first pose again at the end. Raises InvalidData for fewer than 9."""
+    """Directions for the unit, in an order that separates attitude from time. The first
+    pose comes again at the end. Raises InvalidData for fewer than 9."""
     return tuple(PlannedPose(label, (float(x), float(y), float(z))) for label, (x, y, z) in closed(directions(poses)))
 
 
 def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -> uncertainty.Budget:
     """The uncertainty budget by the GUM (JCGM 100). ``stated`` has values that no
-    recording shows, by default those of the calibration. Raises InvalidData
-    after `load` (the document has the budget) and without still poses."""
+    recording shows, by default those of the calibration. Raises InvalidData without
+    still poses, and after `load`: the document has the budget."""
     stated = calibration.stated if stated is None else stated
     if not calibration.poses:
         raise InvalidData(
@@ -344,7 +342,7 @@ def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -
 
 
 def _unit_of(poses: Any) -> str:
-    """What `find_poses` was given, where the poses are still as it gave them."""
+    """The output unit of poses from `find_poses`, else empty."""
     return poses.output_unit if isinstance(poses, Poses) else ""
 
 
@@ -384,8 +382,8 @@ def _poses(
     output_unit: str = "",
 ) -> Sequence[Pose]:
     if u is None and isinstance(poses, Sequence) and all(isinstance(p, Pose) for p in poses):
-        given = {"channels": channels, "time_unit": time_unit, "columns": columns}
-        if needless := next((name for name, value in given.items() if value is not None), None):
+        arguments = {"channels": channels, "time_unit": time_unit, "columns": columns}
+        if needless := next((name for name, value in arguments.items() if value is not None), None):
             raise InvalidData(f"{needless}: the poses are found already; give it to find_poses")
         return list(poses)
     return find_poses(poses, u, channels=channels, time_unit=time_unit, columns=columns, output_unit=output_unit)

@@ -1,5 +1,5 @@
-"""Close the loop: what acts beyond the linear model, with which probability,
-and what the error becomes with it."""
+"""The closed loop: effects beyond the linear model with their probabilities, and the
+error before and after their correction."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from functools import cached_property
 
 import numpy as np
 
+from triaxcal.effects.catalogue import plugins
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, ReferenceEpoch
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.corrected_calibration import corrected
-from triaxcal.evidence.findings import Findings, Named, NotIdentifiable, findings, not_identifiable, stated
-from triaxcal.evidence.model_average import Refusal, average
+from triaxcal.evidence.mixture import OF_DIRECTION
+from triaxcal.evidence.model_average import Refusal, average, corrected
 from triaxcal.evidence.next_measurement import Advice, advice, decided
-from triaxcal.evidence.over_sphere import OF_DIRECTION
 from triaxcal.evidence.partial_residuals import Trace, of_effect, residuals, telling_variables
-from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.posterior import Findings, Named, NotIdentifiable, Posterior, findings, not_identifiable, stated
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.search import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
@@ -33,10 +31,10 @@ from triaxcal.poses.pose import Pose
 from triaxcal.progress import Progress, Stage, unreported
 from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import START_TO_START, NextRecording, next_recording
+from triaxcal.uncertainty.combined import START_TO_START, NextRecording, next_recording
 
 SHOWN = 2
-"""Effects that are only corrected on average, at most, in `Loop.traces`: more
+"""Maximum number of effects in `Loop.traces` that are corrected on average only: more
 would hide the likeliest."""
 Coefficients = Mapping[str, tuple[float, float | None, str]]
 """Name → value, standard error, unit."""
@@ -44,33 +42,33 @@ Coefficients = Mapping[str, tuple[float, float | None, str]]
 
 class Verdict(StrEnum):
     ADOPTED = "adopted"
-    """Known, and corrected."""
+    """The effect acts, and is corrected."""
     CONFOUNDED = "confounded"
-    """One of several acts; or it is known, and no effect is corrected
+    """One of several effects acts; or the effect acts, and no effect is corrected
     (`Loop.refusal`)."""
 
 
 class Recommendation(StrEnum):
-    """What to do with the calibration."""
+    """The recommended use of the calibration."""
 
     USABLE = "usable"
-    """What acts is known and corrected, or nothing does."""
+    """All effects are known and corrected, or none acts."""
     RECORD_MORE = "record_more"
-    """What acts is not known for certain, and poses could tell; or the
-    calibration is less certain than the unit comes back after a start."""
+    """Some effect is uncertain, and further poses would decide; or the calibration is
+    less certain than the start-to-start repeatability of the unit."""
     INVESTIGATE = "investigate"
-    """Something acts that no effect describes, or this is not one unit in one
-    mounting."""
+    """An unmodelled part acts, or the unit or its mounting changed."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that acts for certain, alone or as the likeliest of
-    ``alternatives``, each with its probability; ``together`` is that of at
-    least one of them. A probability is None where nothing tells that it is
-    calibrated (`Loop.stated`). The ``coefficients`` are those that are corrected, or
-    else those if it is this effect that acts; ``remedy`` is how to be rid of
-    it."""
+    """An effect that acts for certain, alone or as the likeliest of competing
+    effects.
+
+    ``alternatives`` has the competing effects with their probabilities, ``together``
+    is the probability that at least one of all acts. A probability is None if nothing
+    shows that it is calibrated (`Loop.stated`). The ``coefficients`` are the corrected
+    ones, else those conditional on this effect. ``remedy`` removes its cause."""
 
     effect: str
     verdict: Verdict
@@ -83,10 +81,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that acts more likely than not, and not for certain: with the
-    ``coefficients`` if it acts. Its ``probability`` is that if the truth is in
-    the catalogue, which nobody knows, and so None (`Loop.stated`);
-    ``hangs_on_one_pose``: it would be certain but for some one pose."""
+    """An effect that acts more likely than not, but not for certain.
+
+    The ``coefficients`` are conditional on the effect. Its ``probability`` holds if
+    the catalogue contains the truth, which is unknown, and so it is None
+    (`Loop.stated`). ``hangs_on_one_pose``: the effect would be certain without some
+    single pose."""
 
     effect: str
     probability: float | None
@@ -96,11 +96,12 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Loop:
-    """The closed loop. ``before`` is the linear calibration, ``after`` the one
-    that is handed on; ``found`` all that is read off the posterior.
-    ``not_identifiable`` are effects that these poses cannot show in full,
-    ``faulty`` those of other packages that cannot be used, each with the
-    reason."""
+    """The result of a diagnosis.
+
+    ``before`` is the linear calibration, ``after`` the calibration to use, ``found``
+    the findings from the posterior. ``not_identifiable`` has the effects that these
+    poses cannot show in full, ``faulty`` the unusable effects of other packages, each
+    with its reason."""
 
     before: Calibration
     after: Calibration
@@ -113,27 +114,31 @@ class Loop:
     faulty: Mapping[str, str]
     posterior: Posterior = field(repr=False, compare=False)
     conditional_on: Mapping[str, Calibration] = field(repr=False, compare=False)
-    """What the calibration would be if an effect acts, of findings that are not
-    corrected and of candidates."""
+    """The calibration conditional on an effect, for candidates and for findings that
+    are not corrected."""
 
     @cached_property
     def traces(self) -> tuple[Trace, ...]:
-        """What the poses show of each finding and each candidate, against what
-        drives it; where there are none, of the likeliest effects that are
-        corrected all the same. Of what has no name, against the variables that
-        tell most of it, with the findings in the model and without what corrects
-        it; the readings first where it goes with the direction. Where the unit or
-        its mounting changed, or no effect probably acts, the residuals."""
+        """Partial residuals of each finding and each candidate against its driving
+        variable; without any, of the likeliest effects that are corrected on average.
+
+        An unmodelled part is shown against the variables that explain most of it, with
+        the findings in the model and without its correction; a part by direction shows
+        the readings first. After a change of the unit or its mounting, or if probably
+        no effect acts, the residuals."""
         rows = self.posterior.evidence.rows
+        # The named effects, else the likeliest of the average.
         names = [*(f.effect for f in self.findings), *(c.effect for c in self.candidates)]
         names = names or sorted(self.averaged, key=lambda name: -self.averaged[name])[:SHOWN]
         of_names = [of_effect(rows, self.conditional_on.get(name, self.after), name) for name in names]
+        # The unmodelled part: significant, or the only explanation that is left.
         something = self.found.nothing < self.posterior.evidence.odds.reported
-        unnamed = self.found.unexplained.significant or (something and not names and not self.found.outliers)
-        by_direction = unnamed and self.found.unexplained.kind in OF_DIRECTION
-        shown = unnamed and self.found.change_point is None
-        of_rest = telling_variables(rows, self._with_findings(), by_direction) if shown else ()
-        found = (*(trace for each in of_names for trace in each), *of_rest)
+        unmodelled = self.found.unexplained.significant or (something and not names and not self.found.outliers)
+        by_direction = unmodelled and self.found.unexplained.kind in OF_DIRECTION
+        shown = unmodelled and self.found.change_point is None
+        of_unmodelled = telling_variables(rows, self._with_findings(), by_direction) if shown else ()
+        # The residuals, if nothing else is shown or the unit changed.
+        found = (*(trace for each in of_names for trace in each), *of_unmodelled)
         return (*found, residuals(self.after)) if self.found.change_point or not found else found
 
     def _with_findings(self) -> Calibration:
@@ -146,8 +151,8 @@ class Loop:
 
     @property
     def averaged(self) -> Mapping[str, float]:
-        """Effects that are corrected by as much as they are probable, and are
-        neither findings nor candidates: each with its probability."""
+        """Effects that the model average corrects and that are neither findings nor
+        candidates, each with its probability."""
         named = {name for f in self.findings for name in (f.effect, *f.alternatives)} | {
             c.effect for c in self.candidates
         }
@@ -155,47 +160,48 @@ class Loop:
 
     @property
     def probabilities(self) -> Mapping[str, float]:
-        """That each effect acts, whatever else does, the likeliest first; as the
-        posterior has it, in whose catalogue the truth is."""
+        """Marginal posterior probability of each effect, the likeliest first. It holds
+        if the catalogue contains the truth."""
         return self.posterior.effect_probabilities
 
     @property
     def stated(self) -> Mapping[str, float | None]:
-        """Those of the ``probabilities`` that are calibrated, else None. One that
-        is likely and not known is not: where the truth is in no catalogue, a
-        likely name is wrong."""
+        """The calibrated ``probabilities``, and None for the others. The probability of
+        a likely but uncertain effect is not calibrated: if the truth is in no
+        catalogue, a likely name is wrong."""
         return stated(self.found, self.probabilities)
 
     @property
     def smooth(self) -> bool:
-        """Whether a smooth function of the direction is corrected in the place
-        of names."""
+        """Whether the calibration corrects a smooth function of the direction in place
+        of named effects."""
         return Empirical().name in self.after.terms
 
     @cached_property
     def advice(self) -> Advice:
-        """What to record next; nothing where that cannot be determined."""
+        """The next measurement; without actions if it cannot be determined."""
         try:
             return advice(self.posterior)
-        except Refused:  # the model has no inverse in poses to come
+        except Refused:  # the model has no inverse in further poses
             return Advice((), 0.0, 0.0, {})
 
     @cached_property
     def next_recording(self) -> NextRecording:
-        """As the recording tells by itself, without what a station knows of its
-        reference."""
+        """The uncertainty in the next recording, from this recording alone, without a
+        station's statements about its reference."""
         return next_recording(self.after, budget(self.after))
 
     @cached_property
     def too_uncertain(self) -> bool:
-        """Whether more poses would make the next recording better, whatever
-        acts: the variance of its error that the calibration itself adds is more
-        than that from start to start, which no pose lessens."""
+        """Whether more poses would improve the next recording: the calibration adds
+        more variance to its error than the start-to-start change, which no pose
+        reduces."""
         known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 
     @cached_property
     def call(self) -> Recommendation:
+        """The recommended use of the calibration."""
         if self.refusal in (Refusal.UNMODELLED, Refusal.CHANGE_POINT):
             return Recommendation.INVESTIGATE
         known = decided(self.posterior) and not self.candidates
@@ -214,16 +220,15 @@ def diagnose(
     odds: Odds | None = None,
     progress: Progress = unreported,
 ) -> Loop:
-    """Find and correct the effects that still poses show beyond the linear
-    model.
+    """Find and correct the effects that still poses show beyond the linear model.
 
-    ``catalogue`` are the effects to look for: all that are known for these
-    poses' channels where it is None. ``check`` are poses of another recording,
-    for the held-out error. ``at`` is the moment of the recording for which the
-    calibration holds elsewhere: a number in seconds from the first sample.
-    ``progress`` is called as the work goes on. Raises as
-    `triaxcal.estimate.pose_fit.fit` does.
+    ``catalogue`` has the effects of the search, by default all known ones for the
+    poses' channels. ``check`` has poses of another recording, for the hold-out error.
+    ``at`` is the moment of the recording for which the calibration holds elsewhere: a
+    number is in seconds from the first sample. The function calls ``progress`` at each
+    stage. It raises the errors of `triaxcal.estimate.pose_fit.fit`.
     """
+    # The linear fit, and the posterior of effects and outliers around it.
     progress(Stage.FIT)
     linear = fit(poses, signs=signs, reference=reference)
     sound = [p for p in poses if not p.fault]
@@ -232,10 +237,13 @@ def diagnose(
         raise Refused("no pose without a fault")
     posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds, progress=progress)
     progress(Stage.ERRORS)
+    # The linear calibration without the outliers of the posterior.
     before = replace(_without_outliers(poses, linear, signs, posterior), holds_at=moment)
+    # The effects that these poses cannot show, or that fail.
     effects = considered(poses, catalogue)
     faulty = faults_of(posterior.evidence.rows, effects)
     hidden = not_identifiable(posterior.evidence, [e for e in effects if e.name not in faulty])
+    # The findings, and the calibration with the correction.
     found = findings(posterior)
     after, refused = corrected(before, posterior, moment)
     before, after = (c.with_blind_to(tuple(hidden)) for c in (before, after))
@@ -259,14 +267,13 @@ def diagnose(
 def _without_outliers(
     poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], posterior: Posterior
 ) -> Calibration:
-    """The linear calibration without the poses that are outliers whatever else
-    acts, and with all others."""
+    """The linear calibration from all poses except the posterior's outliers."""
     likely = {
         int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.outlier_probabilities, strict=True)
     }
     outliers = [i for i, p in likely.items() if reaches(p, posterior.evidence.odds.reported)]
     if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
-        with suppress(Refused):  # the others may not carry a fit
+        with suppress(Refused):  # the other poses may not determine a fit
             linear = fit(poses, signs=signs, reference=linear.reference, excluded=outliers, why=Exclusion.OUTLIER)
     return replace(
         linear, poses=tuple(replace(p, outlier_probability=likely.get(i)) for i, p in enumerate(linear.poses))
@@ -275,22 +282,22 @@ def _without_outliers(
 
 @dataclass(frozen=True)
 class _Report:
-    """What is reported of an effect of this name: as it is in ``after``, or as
-    it would be if it acted."""
+    """The reported figures of an effect: from ``after``, or conditional on the
+    effect."""
 
     posterior: Posterior
     moment: ReferenceEpoch
     after: Calibration
     found: Findings
     conditional: dict[str, Calibration] = field(default_factory=dict)
-    """By name, as `if_it_acts` found them."""
+    """The calibrations of `conditional_on`, by effect."""
 
     def finding(self, named: Named, refused: Refusal | None) -> Finding:
         probabilities = named.probabilities
         name, *others = probabilities
         calibrated = stated(self.found, probabilities)
         adopted = not others and refused is None
-        coefficients, remedy = self._of(self.after, name) if adopted else self.if_it_acts(name)
+        coefficients, remedy = self._of(self.after, name) if adopted else self.conditional_on(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
@@ -304,17 +311,19 @@ class _Report:
     def candidate(self, name: str, probability: float) -> Candidate:
         calibrated = stated(self.found, {name: probability})[name]
         hangs = self.posterior.evidence.odds.hangs_on_one_pose(probability)
-        return Candidate(name, calibrated, self.if_it_acts(name)[0], hangs)
+        return Candidate(name, calibrated, self.conditional_on(name)[0], hangs)
 
-    def if_it_acts(self, name: str) -> tuple[Coefficients, str]:
-        made = average(self.posterior.conditional_on(name), self.moment)
+    def conditional_on(self, name: str) -> tuple[Coefficients, str]:
+        """Coefficients and remedy conditional on the effect."""
+        averaged = average(self.posterior.conditional_on(name), self.moment)
         reference = self.posterior.evidence.rows.problem.channel_reference
         self.conditional[name] = replace(
-            self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference
+            self.after, sensor=averaged.sensor, covariance=averaged.covariance, channel_reference=reference
         )
         return self._of(self.conditional[name], name)
 
     def _of(self, c: Calibration, name: str) -> tuple[Coefficients, str]:
+        """Coefficients and remedy in a calibration."""
         effect, q = next((e, q) for e, q in c.sensor.effects if e.name == name)
         floor = self.after.residual.noise_floor_g
         if not effect.coefficients[0].unit.startswith("g"):

@@ -27,8 +27,12 @@ from triaxcal.estimate.calibration import Origin, PoseResult, ReferenceEpoch, Re
 from triaxcal.inputs.bias_update import Earlier
 from triaxcal.interchange import tables
 from triaxcal.interchange.calibration_document import Document, calibration_document
-from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, uncertainty_over_error
-from triaxcal.interchange.earlier_calibration import earlier_in
+from triaxcal.interchange.calibration_reading import (
+    calibration_of,
+    calibration_part,
+    earlier_in,
+    uncertainty_over_error,
+)
 from triaxcal.poses.covariates import InStream, covariates_elsewhere, followed
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated

@@ -22,8 +22,8 @@ from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import bundle_of
 from triaxcald.recording import schema
 from triaxcald.recording.manifest import load_manifest
-from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import decode_raw
 
 STREAMS = (READINGS, CORRECTED)
 UNSAVED_S = 2.5

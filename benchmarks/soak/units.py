@@ -25,8 +25,8 @@ from benchmarks.soak.bench import BAUDRATE, RATE_HZ, Bench, Unit
 from benchmarks.soak.faults import FLOOD_HZ
 from benchmarks.soak.replies import FRAME, HEADER, Gateway, Replies, SerialCable, foreign_on_line, foreign_on_tcp
 from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.modbus.line import serve_serial, serve_tcp
 from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
-from triaxcal_drivers.modbus.stack import serve_serial, serve_tcp
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.modbus_unit import ModbusMap
 from triaxcald.simulation.time_base import ElasticTimeBase

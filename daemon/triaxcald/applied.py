@@ -14,9 +14,9 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
-from triaxcald.recording.export import Rows
+from triaxcald.recording.reader import is_recording, open_recording
 from triaxcald.recording.schema import Phase
-from triaxcald.recording.series import is_recording, open_recording
+from triaxcald.tables.native_csv import Rows
 from triaxcald.tables.samples import Reading, read_table
 
 BLOCK = 65536

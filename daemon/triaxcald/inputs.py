@@ -20,11 +20,10 @@ from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, of_poses, together
 from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
-from triaxcald.recording.contents import Contents
+from triaxcald.recording.reader import Contents, is_recording, open_recording
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION
 from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
-from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
 from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table

@@ -1,4 +1,4 @@
-"""pytest: a tray is calibrated once, and each slot is a test: `pytest test_units.py`, with STATION in the environment."""
+"""pytest: a tray is calibrated once, each slot is a test. `STATION=station.toml pytest test_units.py`."""
 
 import json
 import os

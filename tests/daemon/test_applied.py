@@ -15,9 +15,9 @@ from triaxcal.documents import Calibration
 from triaxcald.applied import applied
 from triaxcald.errors import InputError
 from triaxcald.inputs import measure
-from triaxcald.recording.export import write_csv
-from triaxcald.tables import source as read_source
+from triaxcald.tables import native_csv
 from triaxcald.tables.arrow import write_parquet
+from triaxcald.tables.native_csv import write_csv
 from triaxcald.tables.samples import Reading, read_table
 
 KINDS = ("csv", "parquet")
@@ -118,14 +118,14 @@ def test_a_gap_far_behind_the_first_block_is_one_too(
     source = tmp_path / "rec.csv"
     source.write_text(lines([f"{row},{i if i < 35 else ''}" for i, row in enumerate(EVERY)], "time,ax,ay,az,gps"))
     once = write_applied(calibration, source, tmp_path / "once.csv")
-    monkeypatch.setattr(read_source, "BLOCK", 1000)  # some ten lines
+    monkeypatch.setattr(native_csv, "BLOCK", 1000)  # some ten lines
     require_same_readings(source, None, once)
 
 
 @pytest.mark.parametrize("block", range(300, 310))
 def test_a_block_may_end_within_a_letter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     rows = [f"{row},25,{'ä' * 40}" for row in EVERY]
-    monkeypatch.setattr(read_source, "BLOCK", block)
+    monkeypatch.setattr(native_csv, "BLOCK", block)
     assert list(read(tmp_path, lines(rows, OWN)).samples.channels) == ["temp_c"]
 
 

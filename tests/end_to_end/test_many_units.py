@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import Workshop
+from triaxcal_drivers.modbus.line import serve_serial
 from triaxcal_drivers.modbus.protocol import SerialLine
-from triaxcal_drivers.modbus.stack import serve_serial
 from triaxcald.audit import audit
 from triaxcald.run.unit_run import Outcome, run_station
 from triaxcald.schema.codes import Stage

@@ -14,7 +14,7 @@ from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.recordings import gather
 from triaxcal.evidence import Refusal, posterior_of
-from triaxcal.evidence.findings import Why
+from triaxcal.evidence.posterior import Why
 from triaxcal.model.samples import Moment
 from triaxcal.poses.pose import Pose
 

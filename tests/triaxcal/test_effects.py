@@ -16,6 +16,7 @@ import pytest
 import triaxcal.effects
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_named, effect_of
+from triaxcal.effects.catalogue import plugins
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import (
     BEFORE,
@@ -35,7 +36,6 @@ from triaxcal.effects.contract import (
 )
 from triaxcal.effects.memory import Hysteresis
 from triaxcal.effects.nonlinear import Compression
-from triaxcal.effects.plugins import plugins
 from triaxcal.effects.thermal import TemperatureLag
 from triaxcal.effects.time import BiasDrift, BiasStep, WarmUp
 from triaxcal.errors import InvalidData

@@ -18,7 +18,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Refusal
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.quality import disturbances
 from triaxcal.poses.stillness.detector import StillnessDetector

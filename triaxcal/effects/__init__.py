@@ -1,5 +1,5 @@
-"""The effects that are known: our own, those of other packages, and those of
-any logged channel."""
+"""The known effects: our own, those of other packages, and those of any logged
+channel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.catalogue import CATALOGUE
+from triaxcal.effects.catalogue import CATALOGUE, package_of, plugins
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import (
     BEFORE,
@@ -30,37 +30,33 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.plugins import package_of, plugins
 from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, of_clocks, runs_named
 
 TEMPERATURE = "temp_c"
 OWN: tuple[Effect, ...] = (*CATALOGUE, *BETWEEN_RUNS, Empirical())
-"""All effects of this package that have a name of their own, those of old
-documents among them."""
+"""All effects of this package that have a fixed name, with those of old documents."""
 
 
 def catalogue_for(covariates: Collection[str]) -> tuple[Effect, ...]:
-    """All effects that a recording with these covariates might show: the
-    catalogue, the plugins, and bias and scale factor by every other channel.
+    """All effects that a recording with these covariates can show: the catalogue,
+    the plugins, and a bias and a scale factor by every other channel.
     """
     effects = (*CATALOGUE, *plugins()[0])
-    # A channel that an effect of somebody else needs is that effect's business,
-    # and may be any other's too.
+    # A channel that a plugin needs may act in other ways, too.
     others = sorted(channel_of(c) for c in covariates if c != TEMPERATURE and not is_derived(c))
-    return (*effects, *(made(c) for c in others for made in (ChannelBias, ChannelScaleFactor)))
+    return (*effects, *(kind(c) for c in others for kind in (ChannelBias, ChannelScaleFactor)))
 
 
 def effect_named(name: str) -> Effect:
-    """Raises KeyError."""
-    for prefix, made in ((BIAS, ChannelBias), (SCALE_FACTOR, ChannelScaleFactor)):
+    """The effect of this name, in its default form. Raises KeyError."""
+    for prefix, kind in ((BIAS, ChannelBias), (SCALE_FACTOR, ChannelScaleFactor)):
         if name.startswith(prefix) and len(name) > len(prefix):
-            return made(name[len(prefix) :])
+            return kind(name[len(prefix) :])
     return {effect.name: effect for effect in (*plugins()[0], *CATALOGUE, Empirical())}[name]
 
 
 def meaning_of(name: str) -> Meaning | None:
-    """What an effect says that it is; None where it says nothing, or is not
-    known."""
+    """The effect's own description. None for an unknown effect, or one without."""
     between = next((e for e in BETWEEN_RUNS if e.name == name), None)
     try:
         return (between or effect_named(name)).meaning
@@ -69,20 +65,21 @@ def meaning_of(name: str) -> Meaning | None:
 
 
 def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
-    """An effect by its name and its coefficients and shape by theirs;
-    coefficients not given are zero.
+    """The effect of this name with its coefficients (p,), from the ``values`` of its
+    coefficients and shape by name. Missing coefficients are zero.
 
-    Raises KeyError for a name that is not known.
+    Raises KeyError for an unknown name.
     """
     between = next((e.named(values) for e in BETWEEN_RUNS if e.name == name), None)
-    whole = between or effect_named(name)
+    effect = between or effect_named(name)
     runs = runs_named(values)
-    for form in (*whole.forms, *(InRuns(form, runs) for form in whole.forms if runs)):
+    # The form that has all these values: alike in all recordings, or in some of them.
+    for form in (*effect.forms, *(InRuns(form, runs) for form in effect.forms if runs)):
         own = [c.name for c in form.coefficients]
         if set(values) <= {*own, *form.shape}:
             shaped = form.shaped({n: values.get(n, v) for n, (v, _) in form.shape.items()}) if form.shape else form
             return shaped, np.array([values.get(n, 0.0) for n in own])
-    known = {n for form in whole.forms for n in (*(c.name for c in form.coefficients), *form.shape)}
+    known = {n for form in effect.forms for n in (*(c.name for c in form.coefficients), *form.shape)}
     raise KeyError(f"{name}.{next((n for n in values if n not in known), ', '.join(values))}")
 
 

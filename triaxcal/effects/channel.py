@@ -1,5 +1,5 @@
-"""Bias and scale factor that change with any other logged channel: a supply
-voltage, a magnetic field, humidity."""
+"""Bias and scale factor in proportion to any other logged channel: a supply voltage,
+a magnetic field, humidity."""
 
 from __future__ import annotations
 

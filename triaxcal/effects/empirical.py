@@ -1,4 +1,4 @@
-"""A smooth term that describes what no effect explains, and explains nothing."""
+"""Non-parametric residual model; no physical meaning."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning
 
 KINDS = {"odd": 3, "even": 4, "time": 4}
-"""Degree of each: the lowest odd and even ones that the nine parameters do not
-absorb, and of time a curve that bends three times; with more it would follow
-the noise."""
+"""Degree of each kind: the lowest odd and even ones that the nine parameters do not
+absorb; for time a curve with three bends. Higher degrees would follow the noise."""
 SMOOTH = "smooth"
 DEGREES = (3, 4, 5, 6)
-"""Of a smooth function of the direction beside the nine parameters: what is
-finer, 26 poses do not show."""
+"""Degrees of a smooth function of the direction, without those of the nine
+parameters. 26 poses do not show finer ones."""
 Terms = tuple[tuple[float, int, int, int], ...]
-"""A polynomial: (factor, powers of x, y, z)."""
+"""A polynomial: (factor, powers of x, y, z) of each monomial."""
 Table = tuple[Ints, Floats]
-"""Polynomials side by side: the powers (m,3) of the monomials in them, and each
-one's factors (m,p)."""
+"""Several polynomials: the powers (m,3) of their monomials, and the factors (m,p) of
+each polynomial."""
 
 
 @dataclass(frozen=True)
 class Empirical(Effect):
-    """``e = s f``: the magnitude is off by the share f, as a smooth function of
-    the direction ("odd" and "even": the solid harmonics of degree 3 and 4 on
+    """``e = s f``: the magnitude has a relative error f, a smooth function of the
+    direction ("odd" and "even": the solid harmonics of degree 3 and 4 on
     the unit sphere, the lowest that the nine parameters do not absorb; "smooth":
-    those of degree 3 to 6), or of the time ("time": a polynomial of degree 4 in
+    those of degree 3 to 6), or of time ("time": a polynomial of degree 4 in
     thousands of seconds).
     """
 
@@ -94,35 +93,39 @@ class Empirical(Effect):
 
 
 def _on_sphere(s: Floats, degree: int) -> tuple[Floats, Floats]:
-    """Harmonics (n,p) of one degree, and their gradient (n,3,p)."""
+    """Harmonics (n,p) of one degree on the unit sphere at the direction of s (n,3),
+    and their gradient (n,3,p) by s."""
     length = np.linalg.norm(s, axis=1)
-    of_values, of_gradient = _tables(degree)
+    # The solid harmonics and their gradient, from the powers of the coordinates.
+    value_table, gradient_table = _tables(degree)
     powers = np.cumprod(np.insert(np.repeat(s[:, :, None], degree, axis=2), 0, 1.0, axis=2), axis=2)
-    values = _valued(of_values, powers)
-    gradient = _valued(of_gradient, powers).reshape(len(s), 3, -1)
-    whole = length[:, None] ** degree
+    values = _evaluate(value_table, powers)
+    gradient = _evaluate(gradient_table, powers).reshape(len(s), 3, -1)
+    # Divided by |s| to the degree, which adds a part along s to the gradient.
+    scale = length[:, None] ** degree
     inward = degree * values[:, None, :] * s[:, :, None] / (length[:, None] ** (degree + 2))[:, :, None]
-    return values / whole, gradient / whole[:, :, None] - inward
+    return values / scale, gradient / scale[:, :, None] - inward
 
 
 @cache
 def harmonics(degree: int) -> tuple[Terms, ...]:
-    """The 2d + 1 harmonic polynomials that begin with p = x^i y^j, Σ (−1)^k
-    z^2k Δ^k p / (2k)!, or with z p, alike."""
+    """The 2d + 1 harmonic polynomials of a degree: Σ (−1)^k z^2k Δ^k p / (2k)! of each
+    p = x^i y^j, and likewise of each z p."""
     out = []
-    for first in (0, 1):
+    for first in (0, 1):  # the power of z in the first monomial
         for i in range(degree - first + 1):
             plane: dict[tuple[int, int], float] = {(i, degree - first - i): 1.0}
             terms = []
             for k in range(degree // 2 + 1):
                 power = 2 * k + first
                 terms += [((-1) ** k * c / factorial(power), a, b, power) for (a, b), c in plane.items() if c]
-                plane = _laplace(plane)
+                plane = _laplacian(plane)
             out.append(tuple(terms))
     return tuple(out)
 
 
-def _laplace(plane: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], float]:
+def _laplacian(plane: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], float]:
+    """Δ of a polynomial in x and y, by powers."""
     out: dict[tuple[int, int], float] = {}
     for (a, b), c in plane.items():
         if a > 1:
@@ -134,9 +137,9 @@ def _laplace(plane: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], fl
 
 @cache
 def _tables(degree: int) -> tuple[Table, Table]:
-    """Of the harmonics, and of their derivatives by x, by y, by z."""
+    """The tables of the harmonics, and of their derivatives by x, by y, by z."""
     polynomials = harmonics(degree)
-    return _table(polynomials), _table([_derived(p, axis) for axis in range(3) for p in polynomials])
+    return _table(polynomials), _table([_derivative(p, axis) for axis in range(3) for p in polynomials])
 
 
 def _table(polynomials: Sequence[Terms]) -> Table:
@@ -148,14 +151,14 @@ def _table(polynomials: Sequence[Terms]) -> Table:
     return np.array(rows), factors
 
 
-def _valued(table: Table, powers: Floats) -> Floats:
-    """The polynomials (n,p) where the coordinates have the ``powers``
-    (n,3,d+1)."""
+def _evaluate(table: Table, powers: Floats) -> Floats:
+    """Values (n,p) of polynomials at the ``powers`` (n,3,d+1) of the coordinates."""
     (i, j, k), factors = table[0].T, table[1]
     return np.asarray((powers[:, 0, i] * powers[:, 1, j] * powers[:, 2, k]) @ factors)
 
 
-def _derived(terms: Terms, axis: int) -> Terms:
+def _derivative(terms: Terms, axis: int) -> Terms:
+    """The derivative of a polynomial by a coordinate."""
     out = []
     for c, *powers in terms:
         if powers[axis]:

@@ -10,20 +10,17 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, Meaning, no_slope, per_axis, signs, xyz
 
-# Output that remembers the pose before.
-
 KINDS = {"memory": "", "reversal": "sign_"}
 REVERSAL = 1e-3
-"""The change along an axis at which its sign is certain, in parts of the
-specific force's order of magnitude; below it the effect goes through zero in a
-straight line."""
+"""The change along an axis from which on its sign is certain, as a share of the order
+of magnitude of the specific force. Below, the effect is linear."""
 
 
 @dataclass(frozen=True)
 class Hysteresis(Effect):
-    """``e_i = q_i p_i``, of the specific force p_i in the pose before
-    ("memory"), or ``q_i sign(Δ_i)``, of the change Δ_i since then, the way on
-    which the pose was reached ("reversal").
+    """``e_i = q_i p_i`` with the specific force p_i in the previous pose ("memory"), or
+    ``q_i sign(Δ_i)`` with the change Δ_i since then, the direction from which the unit
+    reached the pose ("reversal").
     """
 
     kind: str = "memory"
@@ -65,31 +62,29 @@ class Hysteresis(Effect):
         return tuple(Hysteresis(kind) for kind in KINDS)
 
 
-# Bias that keeps the sign of the load in the pose before.
+# Bias that keeps the sign of the load in the previous pose.
 
 DRIVEN = 0.05
-"""The specific force along an axis that leaves the whole offset, in parts of
-its order of magnitude; below it the offset goes through zero in a straight
-line. Bias and noise, which are far smaller, must not decide a sign."""
+"""The specific force along an axis that leaves the full offset, as a share of the
+order of magnitude of the specific force. Below, the offset is linear: bias and noise,
+which are far smaller, must not decide a sign."""
 
 
 @dataclass(frozen=True)
 class Remanence(Effect):
-    """``e_i = q_i sign(p_i)`` of the specific force p_i in the pose before;
-    positive where the reading stays on that side.
+    """``e_i = q_i sign(p_i)`` with the specific force p_i in the previous pose;
+    positive if the reading stays on that side.
 
-    What has been driven to one side and let go keeps an offset of that side,
-    whose size hardly depends on how far it was driven once that was far enough:
-    magnetised iron in the torquer of a servo accelerometer, a charged
-    dielectric beside a capacitive proof mass, a spring or a joint that slipped.
-    `Hysteresis` has the two neighbours of this: an offset in proportion to p_i,
-    and one by the way on which the pose was reached.
+    A load on one side leaves an offset of that side. Its size hardly depends on the
+    load, once that is large enough. Examples are magnetised iron in the torquer of a
+    servo accelerometer, a charged dielectric at a capacitive proof mass, a spring or
+    a joint that slipped. `Hysteresis` has two related effects: an offset in
+    proportion to p_i, and one by the direction of approach.
 
-    In the first pose p_i is that of the pose itself, as if the unit had rested
-    there before, and the fit may leave it out
-    (`triaxcal.poses.covariates.of_unknown_history`). A pose with next to no
-    force along the axis leaves next to nothing, though what was before that one
-    may still be there.
+    The first pose has its own force as p_i, as if the unit had rested there before;
+    the fit may exclude it (`triaxcal.poses.covariates.of_unknown_history`). A pose
+    with almost no force along the axis leaves almost no offset in this model; a real
+    unit may keep an older one.
     """
 
     name: str = "remanence"

@@ -1,4 +1,4 @@
-"""Output that is not straight in the input (IEEE Std 1293)."""
+"""Nonlinear output (IEEE Std 1293)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from triaxcal.effects.contract import (
     xyz,
 )
 
-# Output that bends with the square of the input (IEEE Std 1293: K2).
+# Second-order nonlinearity (IEEE Std 1293: K2).
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SecondOrderNonlinearity(Effect):
         return per_axis_slope(2 * s)
 
 
-# Output that bends with the cube of the input (IEEE Std 1293: K3).
+# Third-order nonlinearity (IEEE Std 1293: K3).
 
 
 @dataclass(frozen=True)
@@ -71,22 +71,20 @@ class ThirdOrderNonlinearity(Effect):
         return per_axis_slope(3 * s**2)
 
 
-# Output that bends with the fifth power of the input, the next odd term of a
-# balanced element after the cube.
+# Fifth-order nonlinearity, the next odd term of a balanced element after the cube.
 
 
 @dataclass(frozen=True)
 class FifthOrderNonlinearity(Effect):
-    """``e_i = q_i s_i⁵``, in units of the reference vector as those of second
-    and third order (IEEE Std 1293 ends its model equation with K3; this goes on
-    with it).
+    """``e_i = q_i s_i⁵``, in units of the reference vector, as the second and third
+    order. IEEE Std 1293 ends its model equation with K3; this term continues it.
 
-    A plain power, so that coefficients of the three orders are those of one
-    polynomial, and mean the same at any full scale. So it is not at right
-    angles to the cube: faces and vertices of a cube have the components 0, 1/√3
-    and 1 alone, where s⁵ is (4 s³ − s)/3, third order and a scale factor. With
-    the edges each shows in full by itself, but of the two together four
-    combinations out of six; directions in between tell the rest.
+    The term is a plain power: the coefficients of the three orders are those of one
+    polynomial, and mean the same at any full scale. So it is not orthogonal to the
+    cube. Faces and vertices of a cube have the components 0, 1/√3 and 1 alone, where
+    s⁵ is (4 s³ − s)/3, third order and a scale factor. With the edges each order is
+    fully observable by itself, and four of six combinations of both. Directions in
+    between show the others.
     """
 
     name: str = "fifth_order_nonlinearity"
@@ -116,8 +114,8 @@ class FifthOrderNonlinearity(Effect):
 
 @dataclass(frozen=True)
 class ScaleFactorAsymmetry(Effect):
-    """``e_i = q_i |s_i|``: the scale factor is 1 + q above zero and 1 − q below
-    it."""
+    """``e_i = q_i |s_i|``: the scale factor is 1 + q for positive and 1 − q for
+    negative input."""
 
     name: str = "scale_factor_asymmetry"
     coefficients: tuple[Coefficient, ...] = xyz("1")
@@ -137,39 +135,36 @@ class ScaleFactorAsymmetry(Effect):
         return per_axis_slope(np.sign(s))
 
 
-# Output that gives way towards the ends of the range, beyond a knee, as one that
-# begins to saturate.
+# Compression towards the ends of the range, beyond a knee: the onset of saturation.
 
 KINDS = {"odd": "", "even": "even_"}
 KNEES = (0.5, 0.6, 0.7, 0.8, 0.9)
-"""In parts of the reference. Below these it is a cube, and above them only
-poses along the axis feel it."""
+"""Knees as shares of the reference. With a lower knee the effect is a cube; a higher
+one affects poses along the axis alone."""
 ROUNDED = 0.1
-"""Width of the bend at the knee, in parts of it."""
+"""Width of the bend, as a share of the knee."""
 
 
 @dataclass(frozen=True)
 class Compression(Effect):
-    """``e_i = −q_i (h(s_i) − h(−s_i))`` ("odd": both ends give way alike) or
-    ``e_i = −q_i (h(s_i) + h(−s_i))`` ("even": the upper end gives way, and the
-    lower one gains as much, beside what "odd" says of both).
+    """``e_i = −q_i (h(s_i) − h(−s_i))`` ("odd": equal compression at both ends) or
+    ``e_i = −q_i (h(s_i) + h(−s_i))`` ("even": compression at the upper end and as
+    much expansion at the lower one, in addition to "odd").
 
-    h(s) is s − κ beyond the knee κ and nothing below it, with a bend of the
-    width w = κ/10 between: h(s) = w (ln(1 + exp((s − κ)/w)) − ln(1 +
-    exp(−κ/w))). So q_i is the share of the slope that is lost beyond the knee,
-    positive where the output falls behind: 0 none of it, 1 a stop. The scale
-    factor is that below the knee.
+    h(s) is s − κ beyond the knee κ and zero below it, with a bend of the width
+    w = κ/10 between: h(s) = w (ln(1 + exp((s − κ)/w)) − ln(1 + exp(−κ/w))). So q_i is
+    the lost share of the slope beyond the knee, positive for compression: 0 is no
+    loss, 1 a stop. The scale factor is that below the knee.
 
-    An amplifier whose output nears its supply, or a torquer whose current nears
-    its limit, keeps its gain up to some load and loses it there within a short
-    way, which a cube does not follow: that bends everywhere, and most in the
-    middle between the ends. Where the range lies evenly about zero both ends
-    give way (odd); bias, or a supply with unequal halves, brings one end nearer
-    (odd and even by half each, where it is one alone). The bend's width is
-    assumed, since poses that are few along any axis could not tell it.
+    An amplifier near its supply, or a torquer near its current limit, keeps its gain
+    up to some load and loses it there over a short range. A cube does not follow this,
+    as it bends everywhere. With a range that is symmetric about zero both ends are
+    compressed (odd). A bias, or a supply with unequal halves, brings one end nearer:
+    compression at one end alone is odd and even by half each. The width of the bend is
+    assumed, as few poses along an axis do not determine it.
 
-    The knee is in units of the reference vector; the search tries some parts of
-    it, whatever the unit.
+    The knee is in units of the reference vector. The search tries fixed shares of the
+    reference, in any unit.
     """
 
     kind: str = "odd"
@@ -194,15 +189,16 @@ class Compression(Effect):
         return per_axis(lower - upper if self.kind == "odd" else -upper - lower)
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        upper, lower = self._share_beyond(s), self._share_beyond(-s)
+        upper, lower = self._hinge_slope(s), self._hinge_slope(-s)
         return per_axis_slope(-upper - lower if self.kind == "odd" else lower - upper)
 
     def _hinge(self, s: Floats) -> Floats:
+        """h(s)."""
         width = ROUNDED * self.knee
         return np.asarray(width * (np.logaddexp(0.0, (s - self.knee) / width) - np.logaddexp(0.0, -1 / ROUNDED)))
 
-    def _share_beyond(self, s: Floats) -> Floats:
-        """The derivative of the hinge, 0…1."""
+    def _hinge_slope(self, s: Floats) -> Floats:
+        """The derivative of h, 0…1."""
         return np.asarray((1 + np.tanh((s - self.knee) / (2 * ROUNDED * self.knee))) / 2)
 
     @property
@@ -214,8 +210,8 @@ class Compression(Effect):
         return tuple(Compression(kind, self.knee) for kind in KINDS)
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Both forms with every knee. How long the reference vector is, the
-        poses before tell."""
+        """Both forms with every knee. The specific forces of the previous poses give
+        the magnitude of the reference."""
         before = [covariates[n] for n in BEFORE if n in covariates]
         reference = float(np.median(np.linalg.norm(before, axis=0))) if len(before) == len(BEFORE) else 1.0
         return tuple(Compression(kind, float(f"{k * reference:.4g}")) for kind in KINDS for k in KNEES)
@@ -224,20 +220,20 @@ class Compression(Effect):
         return replace(self, knee=values["knee"])
 
 
-# Output that changes with the product of two components of the input (IEEE Std
-# 1293: Kip, Kio, Kpo), or with the square of a component across the axis.
+# Cross-coupling: products of two components of the input (IEEE Std 1293: Kip, Kio,
+# Kpo), and squares of a component across the axis.
 
 PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-"""(axis, other): the axis reads its own component times the other."""
+"""(axis, other): the output of an axis has its own component times the other."""
 OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
 """Each axis, and the two others."""
 Product = tuple[int, int, int]
-"""(axis, one, other): the axis reads the product of these two components."""
+"""(axis, one, other): the output of an axis has the product of two components."""
 
 
 def _products() -> dict[str, tuple[str, Product]]:
-    """Every product but the square of the axis's own component: name → (part,
-    product). Products of one part add the same to |a|."""
+    """All products except the square of the axis's own component: name → (part,
+    product). Products of one part make the same contribution to |a|."""
     letters = "xyz"
     out = {f"{letters[i]}_{letters[i]}{letters[j]}": (f"{i}{j}", (i, i, j)) for i, j in PAIRS}
     out |= {f"{letters[j]}_{2 * letters[i]}": (f"{i}{j}", (j, i, i)) for i, j in PAIRS}
@@ -252,11 +248,11 @@ class CrossCoupling(Effect):
     """``e_i = q_ij s_i s_j + q_xyz s_j s_k``, or all quadratic forms across the
     axes (``whole``): ``e_i = q_ij s_i s_j + r_ij s_j² + p_i s_j s_k``.
 
-    Still poses show |a| alone. There s_i s_j on axis i is the same as s_i² on
-    axis j, and the products of the two other components count by their sum. The
-    first form has one coefficient for each function that |a| shows: the one to
-    fit. The whole form has every coefficient that a unit may have, which only a
-    prior distinguishes: the one to average over.
+    Still poses show |a| alone. There s_i s_j on axis i is equivalent to s_i² on axis j,
+    and the products of the two other components appear as their sum. The first form
+    has one coefficient for each function that |a| shows, and is the one to fit. The
+    whole form has all coefficients of a unit, which only a prior distinguishes, and is
+    the one to average over.
     """
 
     whole: bool = False
@@ -287,13 +283,13 @@ class CrossCoupling(Effect):
         return CrossCoupling(), CrossCoupling(whole=True)
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """The whole form: a mean over the first alone would name one of many
-        that look the same."""
+        """The whole form: the first alone would select one of several equivalent
+        models."""
         return (CrossCoupling(whole=True),)
 
     @property
-    def _places(self) -> list[tuple[int, Product]]:
-        """Of every product the place of its coefficient."""
+    def _products_by_column(self) -> list[tuple[int, Product]]:
+        """The column of the coefficient of every product."""
         products = [product for _, product in PRODUCTS.values()]
         if self.whole:
             return list(enumerate(products))
@@ -303,20 +299,20 @@ class CrossCoupling(Effect):
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         out = np.zeros((len(s), 3, len(self.coefficients)))
-        for k, (axis, one, other) in self._places:
+        for k, (axis, one, other) in self._products_by_column:
             out[:, axis, k] = s[:, one] * s[:, other]
         return out
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         out = np.zeros((len(s), 3, 3, len(self.coefficients)))
-        for k, (axis, one, other) in self._places:
+        for k, (axis, one, other) in self._products_by_column:
             out[:, axis, one, k] += s[:, other]
             out[:, axis, other, k] += s[:, one]
         return out
 
 
-# Bias that vibration makes, as nonlinearity turns its variance into a mean (IEEE
-# Std 1293: VRE).
+# Vibration rectification: nonlinearity turns the variance of vibration into a bias
+# (IEEE Std 1293: VRE).
 
 
 @dataclass(frozen=True)

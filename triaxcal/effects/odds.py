@@ -1,5 +1,5 @@
-"""How likely effects are, and of which size, before any pose was seen: what the
-posterior of a diagnosis and the budget of a fit have in common."""
+"""Prior odds and sizes of effects, before any pose: the posterior of a diagnosis and
+the budget of a fit share them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 EFFECT_ODDS = 0.3
-"""That some effect of the catalogue acts, shared evenly among the names that
-can; a second one likewise."""
+"""Odds that some effect of the catalogue acts, shared evenly among the possible names;
+also of a second effect."""
 ON_ONE_AXIS, ON_TWO_AXES = 0.25, 0.25
-"""Of an effect with a part for each axis: usually, in the half that is left, one
-mechanism acts on all of them."""
+"""Probabilities for an effect with a part for each axis. In the remaining half one
+mechanism acts on all axes, as is usual."""
 SMALLEST = 0.1
-"""Size of the least effect, of the noise of a pose: what is less shows in no
-data."""
+"""Size of the smallest effect, in noises of a pose: no data show a smaller one."""
 SIZES = 9
-"""Steps from there to the largest, even in the logarithm: a factor of 3 to 5,
-within which the evidence hardly changes."""
+"""Number of sizes up to the largest, even in the logarithm: steps by a factor of 3 to
+5, within which the evidence hardly changes."""
 AXES = 3
 """The sensitive axes, and the components of a vector."""
 
@@ -25,21 +24,23 @@ AXES = 3
 def on_axes(
     parts: Sequence[str], one: float = ON_ONE_AXIS, two: float = ON_TWO_AXES
 ) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Of coefficients that belong to these parts, which are free, and with which
-    share of the prior; ``one`` and ``two`` are those of one axis and of two."""
+    """The sets of free coefficients, by index, each with its share of the prior.
+
+    ``parts`` has the part of each coefficient. ``one`` and ``two`` are the shares of
+    effects on one axis and on two axes."""
     labels = list(dict.fromkeys(parts))
-    whole = tuple(range(len(parts)))
+    every = tuple(range(len(parts)))
     if len(labels) == 1:
-        yield whole, 1.0
+        yield every, 1.0
         return
     two = two if len(labels) == AXES else 0.0
-    yield whole, 1 - one - two
+    yield every, 1 - one - two
 
-    def of(some: Sequence[str]) -> tuple[int, ...]:
+    def free(some: Sequence[str]) -> tuple[int, ...]:
         return tuple(i for i, part in enumerate(parts) if part in some)
 
     for label in labels:
-        yield of([label]), one / len(labels)
+        yield free([label]), one / len(labels)
     if two:
         for pair in combinations(labels, 2):
-            yield of(pair), two / AXES
+            yield free(pair), two / AXES

@@ -12,135 +12,135 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import CLOCKS, RUN, SINCE_START, TIME, Coefficient, Effect, Meaning, no_slope, xyz
 
-# An effect that stands for another: what it does not say anew is the other's.
+# A wrapper of another effect, which delegates everything that it does not override.
 
 
 @dataclass(frozen=True, eq=False)
 class Wrapped(Effect):
-    """``whole`` in another guise. It comes in no other forms than this, unless
-    said otherwise."""
+    """Delegates to the effect ``inner``. The default has one form, this one."""
 
-    whole: Effect
+    inner: Effect
 
     @property
     def name(self) -> str:
-        return self.whole.name
+        return self.inner.name
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return self.whole.coefficients
+        return self.inner.coefficients
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return self.whole.needs
+        return self.inner.needs
 
     @property
     def remedy(self) -> str:
-        return self.whole.remedy
+        return self.inner.remedy
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.basis(s, covariates)
+        return self.inner.basis(s, covariates)
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.slope(s, covariates)
+        return self.inner.slope(s, covariates)
 
     def advice(self, largest: float, floor: float) -> str:
-        return self.whole.advice(largest, floor)
+        return self.inner.advice(largest, floor)
 
     @property
     def meaning(self) -> Meaning | None:
-        return self.whole.meaning
+        return self.inner.meaning
 
     @property
     def absent(self) -> str:
-        return self.whole.absent
+        return self.inner.absent
 
     @property
     def shape(self) -> Mapping[str, tuple[float, str]]:
-        return self.whole.shape
+        return self.inner.shape
 
     def shaped(self, values: Mapping[str, float]) -> Self:
-        return replace(self, whole=self.whole.shaped(values))
+        return replace(self, inner=self.inner.shaped(values))
 
 
-# An effect of the clocks in some of several recordings of a unit, with coefficients
-# of its own in each.
+# An effect of the clocks in some of several recordings of a unit, with its own
+# coefficients in each.
 
 NAMED = re.compile(r"(.+)_run([1-9]\d*)")
 
 
 def of_clocks(effect: Effect) -> bool:
-    """Whether an effect depends on nothing but the clocks, which start anew in
-    every recording."""
+    """Whether an effect depends on the clocks alone, which restart in every
+    recording."""
     return bool(effect.needs) and set(effect.needs) <= set(CLOCKS)
 
 
 @dataclass(frozen=True)
 class InRuns(Wrapped):
-    """``whole`` in ``runs`` (0-based); in the others it is zero, or, where it
-    is `Effect.lasting`, what it was before in earlier ones. Coefficients are
-    named ``x_run2`` for x in the second recording.
+    """The effect ``inner`` in ``runs`` (0-based). It is zero in the others; an effect
+    that is `Effect.lasting` has its initial value in earlier ones. ``x_run2`` is the
+    coefficient x in the second recording.
     """
 
     runs: tuple[int, ...]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        own = self.whole.coefficients
+        own = self.inner.coefficients
         return tuple(Coefficient(f"{c.name}_run{run + 1}", c.unit, c.part) for run in self.runs for c in own)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (*self.whole.needs, RUN)
+        return (*self.inner.needs, RUN)
 
     @property
     def absent(self) -> str:
-        # What lasts begins in one run, by whose clock its moment is reckoned.
-        return self.whole.absent + (f" of recording {self.runs[0] + 1}" if self.whole.lasting else "")
+        # A lasting effect begins in one run; its moment is on that run's clock.
+        return self.inner.absent + (f" of recording {self.runs[0] + 1}" if self.inner.lasting else "")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        parts = [np.where(there[:, None, None], self.whole.basis(s, c), 0.0) for there, c in self._by_run(covariates)]
+        parts = [np.where(active[:, None, None], self.inner.basis(s, c), 0.0) for active, c in self._by_run(covariates)]
         return np.concatenate(parts, axis=-1)
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         parts = [
-            np.where(there[:, None, None, None], self.whole.slope(s, c), 0.0) for there, c in self._by_run(covariates)
+            np.where(active[:, None, None, None], self.inner.slope(s, c), 0.0) for active, c in self._by_run(covariates)
         ]
         return np.concatenate(parts, axis=-1)
 
     def _by_run(self, covariates: Mapping[str, Floats]) -> Iterator[tuple[Bools, Mapping[str, Floats]]]:
-        """For each run: where it acts (n,), and covariates whose clocks stand
-        outside the run as they do in use."""
+        """For each run: the poses (n,) in which the effect acts, and the covariates.
+        Outside the run their clocks have the values of a unit in use, or of the time
+        before a lasting effect."""
         index = covariates[RUN]
         for run in self.runs:
-            outside = np.where((index < run) & self.whole.lasting, -np.inf, np.inf)
-            held = dict(covariates)
-            if TIME in held:
-                held[TIME] = np.where(index == run, held[TIME], 0.0)
-            if SINCE_START in held:
-                held[SINCE_START] = np.where(index == run, held[SINCE_START], outside)
-            yield (index == run) | (self.whole.lasting & (index < run)), held
+            outside = np.where((index < run) & self.inner.lasting, -np.inf, np.inf)
+            values = dict(covariates)
+            if TIME in values:
+                values[TIME] = np.where(index == run, values[TIME], 0.0)
+            if SINCE_START in values:
+                values[SINCE_START] = np.where(index == run, values[SINCE_START], outside)
+            yield (index == run) | (self.inner.lasting & (index < run)), values
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(InRuns(v, self.runs) for v in self.whole.variants(longest(covariates, self.runs)))
+        return tuple(InRuns(v, self.runs) for v in self.inner.variants(longest_run(covariates, self.runs)))
 
 
-def longest(covariates: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, Floats]:
-    """The covariates in that of the runs which has the most poses."""
+def longest_run(covariates: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, Floats]:
+    """The covariates in the run with the most poses."""
     index = covariates[RUN]
-    rows = max((index == run for run in runs), key=lambda there: int(there.sum()))
+    rows = max((index == run for run in runs), key=lambda poses: int(poses.sum()))
     return {name: values[rows] for name, values in covariates.items()}
 
 
 def runs_named(coefficients: Iterable[str]) -> tuple[int, ...]:
-    """The runs (0-based) that names of coefficients speak of; none where they
-    speak of all alike."""
+    """The runs (0-based) in the names of coefficients; none for coefficients of all
+    runs."""
     found = {int(match[2]) - 1 for name in coefficients if (match := NAMED.fullmatch(name))}
     return tuple(sorted(found))
 
 
-# Bias and scale factor that differ from recording to recording of a unit: their
-# repeatability from start to start.
+# Bias and scale factor that differ between the recordings of a unit: their
+# start-to-start repeatability.
 
 _OF_RUNS = "q: one for each recording, their sum zero; where one recording alone differs, zero in the others"
 _AGAINST_FIRST = "{by} in recording {n}, −{by} in recording 1"
@@ -149,12 +149,12 @@ ALONE = re.compile(r"[xyz]_run([1-9]\d*)_alone")
 
 @dataclass(frozen=True)
 class RunBias(Effect):
-    """``e_i = q_ik`` in run k of ``runs``, but for the first, where it is minus
-    the sum of the others: the unit's bias is the mean over the recordings.
-    ``x_run2`` is that of x in the second.
+    """``e_i = q_ik`` in run k of ``runs``. In the first run it is minus the sum of the
+    others, so the unit's bias is the mean over the recordings. ``x_run2`` is the
+    coefficient of x in the second.
 
-    With ``alone`` (0-based), e_i = q_i in that run and zero in all others,
-    whose bias is the unit's: ``x_run2_alone``.
+    With ``alone`` (0-based), e_i = q_i in that run and zero in all others, which have
+    the unit's bias: ``x_run2_alone``.
     """
 
     runs: int = 2
@@ -183,7 +183,7 @@ class RunBias(Effect):
         return f"Look for what was different in recording {self.alone + 1}: a knock, a pause, another temperature."
 
     def named(self, coefficients: Iterable[str]) -> Self:
-        """That which coefficients of these names are of."""
+        """The effect with coefficients of these names."""
         names = list(coefficients)
         alone = [int(match[1]) - 1 for name in names if (match := ALONE.fullmatch(name))]
         if alone:
@@ -210,22 +210,22 @@ class RunBias(Effect):
         return no_slope(s, len(self.coefficients))
 
     def _contrasts(self, covariates: Mapping[str, Floats]) -> list[Floats]:
-        """(n,) each: the share that a pose has in the coefficients of each run."""
+        """(n,) for each run: the factor of its coefficients in each pose."""
         index = covariates[RUN]
         if self.alone is not None:
             return [(index == self.alone).astype(float)]
         return [(index == k).astype(float) - (index == 0) for k in range(1, self.runs)]
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """In every run another, and in one run alone where there are more than
-        two."""
+        """A value for each run, and, with more than two runs, one run that differs
+        alone."""
         single = range(self.runs) if self.runs > 2 else ()
         return (self, *(replace(self, alone=run) for run in single))
 
 
 @dataclass(frozen=True)
 class RunScaleFactor(RunBias):
-    """``e_i = q_ik s_i`` likewise: the unit's scale factor is the mean over the
+    """``e_i = q_ik s_i``, as `RunBias`: the unit's scale factor is the mean over the
     recordings."""
 
     name: str = "run_scale_factor"

@@ -62,8 +62,7 @@ class TemperatureBias(Effect):
 
 @dataclass(frozen=True)
 class TemperatureBiasQuadratic(Effect):
-    """``e_i = p_i (T − T_ref) + q_i (T − T_ref)²``; the linear part belongs to
-    it, as a parabola has one."""
+    """``e_i = p_i (T − T_ref) + q_i (T − T_ref)²``, a parabola with its linear part."""
 
     name: str = "temperature_bias_quadratic"
     coefficients: tuple[Coefficient, ...] = (
@@ -119,34 +118,33 @@ class TemperatureScaleFactor(Effect):
         return per_axis_slope(np.repeat(covariates["temp_c"][:, None], 3, axis=1))
 
 
-# Bias that follows the temperature late, as what makes it warms later than the
+# Bias that lags behind the temperature, because its cause warms later than the
 # thermometer.
 
 CHANNEL = "temp_c"
 SLOWEST = 2.0
-"""Lengths of the recording. The lag of such a time constant has followed an
-early step by 39 % at the end; a slower one is a drift to these poses."""
+"""The largest time constant, in durations of the recording. Such a lag has followed an
+early step by 39 % at the end. A slower one is a drift in these poses."""
 
 
 @dataclass(frozen=True)
 class TemperatureLag(Effect):
-    """``e_i = q_i (θ − T_ref)`` of a temperature θ that follows that of the
-    thermometer by a first-order lag, τ dθ/dt = T − θ.
+    """``e_i = q_i (θ − T_ref)`` with a temperature θ that follows the thermometer by a
+    first-order lag, τ dθ/dt = T − θ.
 
-    To the first order θ = T − τ dT/dt, which is a bias by temperature beside
-    one by its rate (`ThermalGradient`); once the temperature changes within τ,
-    θ depends on what it was before. A pose does not know that by itself, so θ −
-    T is a covariate of the poses, derived from all of a recording for certain
-    time constants (`triaxcal.effects.contract.lag_of`,
-    `triaxcal.poses.covariates.lag_deviation`): the temperature goes straight
-    from the middle of one pose to that of the next, and stood still before the
-    first. What it did there, nobody knows; that goes out by exp(−t/τ), as a
-    `WarmUp` of the same time constant would. In use, where no lag is given, the
+    To the first order θ = T − τ dT/dt: a bias by temperature and one by its rate
+    (`ThermalGradient`). If the temperature changes within τ, θ depends on the earlier
+    temperature, which one pose does not contain. So θ − T is a covariate of the poses,
+    derived from the whole recording for fixed time constants
+    (`triaxcal.effects.contract.lag_of`, `triaxcal.poses.covariates.lag_deviation`).
+    The temperature is interpolated linearly between the middles of the poses, and is
+    constant before the first. The error of this assumption decays by exp(−t/τ), as a
+    `WarmUp` of the same time constant does. In use there is no lag, and the
     temperature counts as settled: θ = T.
 
-    A time constant between two of those known has the mean of theirs, weighted
-    by its logarithm, which is right within three per cent of the lag; beyond
-    them it counts as the nearest.
+    A time constant between two fixed ones has the mean of their lags, weighted by its
+    logarithm, which is right within three per cent of the lag. Beyond them the nearest
+    one counts.
     """
 
     time_constant_s: float = 330.0
@@ -172,14 +170,14 @@ class TemperatureLag(Effect):
         return steady_within(self.remedy, largest, floor, "K")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        behind = sum(weight * covariates[lag_of(CHANNEL, c)] for c, weight in self._weights().items())
-        return on_each_axis(covariates[CHANNEL] + behind)
+        lag = sum(weight * covariates[lag_of(CHANNEL, c)] for c, weight in self._weights().items())
+        return on_each_axis(covariates[CHANNEL] + lag)
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
     def _weights(self) -> dict[int, float]:
-        """Of the time constants that are known, those next to its own."""
+        """The neighbouring fixed time constants, and their weights."""
         nodes = np.log(LAGS_S)
         place = float(np.interp(np.log(max(self.time_constant_s, 1e-9)), nodes, np.arange(len(nodes))))
         low, share = int(place), place % 1
@@ -190,10 +188,10 @@ class TemperatureLag(Effect):
         return {"time_constant": (self.time_constant_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Those known, from what a few poses show to where the lag has hardly
-        begun to follow at the end."""
-        shortest, whole = span_of(covariates[SINCE_START])
-        tried = [c for c in LAGS_S if shortest <= c <= SLOWEST * whole]
+        """The fixed time constants from the shortest that a few poses show to `SLOWEST`
+        durations."""
+        shortest, duration = span_of(covariates[SINCE_START])
+        tried = [c for c in LAGS_S if shortest <= c <= SLOWEST * duration]
         return tuple(self.shaped({"time_constant": float(c)}) for c in tried) or (self,)
 
     def shaped(self, values: Mapping[str, float]) -> Self:

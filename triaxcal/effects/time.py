@@ -25,11 +25,10 @@ from triaxcal.effects.contract import (
     xyz,
 )
 
-# Bias that moves with time, along a polynomial.
+# Bias that drifts with time along a polynomial.
 
 DEGREES = (1, 2, 3)
-"""Straight, bent once, bent twice; a higher degree would follow anything that
-is slow."""
+"""A line, one bend, two bends. A higher degree would follow any slow change."""
 
 
 @dataclass(frozen=True)
@@ -69,21 +68,21 @@ class BiasDrift(Effect):
         return tuple(BiasDrift(degree) for degree in DEGREES)
 
 
-# Bias that jumps once, at a moment that nobody knows: a knock, a supply that
-# switched, a loose part.
+# Bias that steps once, at an unknown moment: a knock, a supply that switched, a loose
+# part.
 
 MOMENTS = 200
-"""At most: between the poses and in them, up to 101 poses. Of longer recordings
-a diagnosis divides the likeliest moments afterwards."""
+"""Maximum number of moments: those between and in up to 101 poses. In longer
+recordings a diagnosis refines the likeliest moments afterwards."""
 
 
 @dataclass(frozen=True)
 class BiasStep(Effect):
-    """``e_i = −q_i`` before the step, zero after it: what the unit is after the
-    step is the reference.
+    """``e_i = −q_i`` before the step, zero after it: the unit after the step is the
+    reference.
 
-    ``at_s`` counts from the start of the recording. In a pose that the step
-    falls into the part before it counts.
+    ``at_s`` counts from the start of the recording. A pose with the step inside has
+    the share of its duration before the step.
     """
 
     at_s: float = 0.0
@@ -104,9 +103,9 @@ class BiasStep(Effect):
     )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        held = np.maximum(covariates[DURATION], 1e-9)
-        begin = covariates[SINCE_START] - held / 2
-        return on_each_axis(-np.clip((self.at_s - begin) / held, 0.0, 1.0))
+        duration = np.maximum(covariates[DURATION], 1e-9)
+        begin = covariates[SINCE_START] - duration / 2
+        return on_each_axis(-np.clip((self.at_s - begin) / duration, 0.0, 1.0))
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
@@ -120,11 +119,11 @@ class BiasStep(Effect):
         return {"at": (self.at_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Between any two poses, and in the middle of any but the first and the
-        last; `MOMENTS` of these, evenly spread, where they are more."""
-        t, held = covariates[SINCE_START], covariates[DURATION]
+        """Moments between any two poses, and in the middle of any pose but the first
+        and the last; at most `MOMENTS` of them, evenly spread."""
+        t, duration = covariates[SINCE_START], covariates[DURATION]
         order = np.argsort(t)
-        begin, end = (t - held / 2)[order], (t + held / 2)[order]
+        begin, end = (t - duration / 2)[order], (t + duration / 2)[order]
         moments = np.sort([*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]])
         return tuple(self.shaped({"at": float(m)}) for m in evenly_spread(moments, MOMENTS))
 
@@ -132,15 +131,16 @@ class BiasStep(Effect):
         return replace(self, at_s=values["at"])
 
 
-# Bias that settles exponentially after the start, as a unit that warms up does.
+# Bias that settles exponentially after the start: warm-up.
 
 CONSTANTS = 8
-"""Time constants tried, evenly in the logarithm: a factor of 1.8 apart in 27
-poses. More cost time for each hypothesis; fewer leave gaps between the
+"""Number of time constants in the search, even in the logarithm: a factor of 1.8
+apart in 27 poses. More cost time for each hypothesis; fewer leave gaps between the
 shapes."""
 SLOWEST = 4.0
-"""Lengths of the recording. Over a quarter of its time constant an exponential
-is off its chord by 3 % of its change: what is slower is a straight drift."""
+"""The largest time constant, in durations of the recording. Over a quarter of its time
+constant an exponential departs from its chord by 3 % of its change. A slower one is a
+straight drift."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +168,8 @@ class WarmUp(Effect):
         return no_slope(s)
 
     def advice(self, largest: float, floor: float) -> str:
-        """After how long no more than the floor is left. Whoever records from
-        the moment of switching on waits as long; who began later has waited
-        before."""
+        """The remedy with the time after which no more than ``floor`` is left, counted
+        from the first sample. A recording that began later needs less."""
         if not 0 < floor < abs(largest):
             return self.remedy
         wait_s = self.time_constant_s * math.log(abs(largest) / floor)
@@ -182,24 +181,24 @@ class WarmUp(Effect):
         return {"time_constant": (self.time_constant_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """From what three poses show to what is straight over the recording but
-        for a few per cent."""
-        shortest, whole = span_of(covariates[SINCE_START])
+        """Time constants from the shortest that three poses show to one that is
+        straight over the recording within a few per cent."""
+        shortest, duration = span_of(covariates[SINCE_START])
         return tuple(
-            self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * whole, CONSTANTS)
+            self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * duration, CONSTANTS)
         )
 
     def shaped(self, values: Mapping[str, float]) -> Self:
         return replace(self, time_constant_s=values["time_constant"])
 
 
-# Scale factor that moves steadily with time.
+# Scale factor that drifts steadily with time.
 
 
 @dataclass(frozen=True)
 class ScaleFactorDrift(Effect):
-    """``e_i = q_i (t − t_ref) s_i``: the scale factor grows by the share q_i a
-    second, as a reference voltage or a magnet that warms or ages makes it."""
+    """``e_i = q_i (t − t_ref) s_i``: the scale factor changes by the share q_i per
+    second, for example by a reference voltage or a magnet that warms or ages."""
 
     name: str = "scale_factor_drift"
     coefficients: tuple[Coefficient, ...] = xyz("1/s")

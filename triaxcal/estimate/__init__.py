@@ -1,12 +1,10 @@
 """From poses to a calibration: closed form, maximum likelihood, outliers,
 cross-validation."""
 
-from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult, Residual
+from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult, Reduced, Residual, reduced
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
-from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.poses_from_means import poses_of_means
-from triaxcal.estimate.projected_calibration import Reduced, reduced
+from triaxcal.estimate.pose_fit import fit, poses_of_means
 from triaxcal.estimate.recordings import (
     gather,
     residuals_by_run,

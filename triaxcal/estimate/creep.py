@@ -14,8 +14,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, linearise_all, residual_chi2
 from triaxcal.poses.covariates import covariates_elsewhere, rate_of_lag

@@ -17,7 +17,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import RUN, Effect
-from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, Wrapped, longest, of_clocks
+from triaxcal.effects.runs import BETWEEN_RUNS, InRuns, Wrapped, longest_run, of_clocks
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
@@ -65,24 +65,24 @@ class ByRun(Wrapped):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (*self.whole.needs, RUN)
+        return (*self.inner.needs, RUN)
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         out: list[Effect] = []
         # The same in all runs, on the clock of the longest run.
-        if not self.whole.lasting:
-            out += self.whole.variants(longest(covariates, range(self.runs)))
+        if not self.inner.lasting:
+            out += self.inner.variants(longest_run(covariates, range(self.runs)))
         # With coefficients of their own, as far as the runs have poses enough.
         for runs in self._sets():
             fewest = min(int(np.sum(covariates[RUN] == run)) for run in runs)
             most = len(runs) * fewest / POSES_A_COEFFICIENT
-            out += [e for e in InRuns(self.whole, runs).variants(covariates) if len(e.coefficients) <= most]
+            out += [e for e in InRuns(self.inner, runs).variants(covariates) if len(e.coefficients) <= most]
         return tuple(out)
 
     def _sets(self) -> list[tuple[int, ...]]:
         every = tuple(range(self.runs))
         sets: list[tuple[int, ...]] = [(run,) for run in every]
-        if self.whole.lasting:
+        if self.inner.lasting:
             return sets
         if self.runs > 2:
             sets += [tuple(other for other in every if other != run) for run in every]

@@ -1,16 +1,15 @@
-"""What acts beyond the linear model, with which probability: one evidence for
-effects, outliers and what has no name.
+"""The posterior of all departures from the linear model: one evidence for effects,
+outliers and unmodelled parts.
 
-`triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it
-against what went before.
+`triaxcal.diagnosis` draws the conclusions; `benchmarks.frozen` compares them with
+those of earlier versions.
 """
 
-from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained, findings
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind, Advice, Expected, advice
 from triaxcal.evidence.partial_residuals import POSE, Quantity, Trace, unit_of
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.posterior import ChangePoint, Findings, Named, Posterior, Unexplained, findings
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.search import posterior_of
 

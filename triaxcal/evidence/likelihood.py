@@ -13,11 +13,10 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp, softmax
+from triaxcal.evidence.covariances import OWN, LowRank, RowPrecision, UnmodelledCovariance, kinds_of, local_kinds_of
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.row_covariance import LowRank, RowPrecision
 from triaxcal.evidence.terms import Term, TermColumns, WeightedColumns
-from triaxcal.evidence.unmodelled_kernels import OWN, UnmodelledCovariance, kinds_of, local_kinds_of
 
 # The assumptions on the unmodelled part, and the data weighted under each.
 

@@ -13,15 +13,20 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import channel_of, is_derived
-from triaxcal.effects.plugins import EffectFault
+from triaxcal.evidence.covariances import (
+    PoseInputs,
+    RowPrecision,
+    UnmodelledCovariance,
+    UnmodelledKind,
+    reading_geometry,
+)
 from triaxcal.evidence.likelihood import Evidence, SetEvidence
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.mixture import Components, components
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.row_covariance import RowPrecision
 from triaxcal.evidence.terms import Term
-from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledCovariance, UnmodelledKind, reading_geometry
 from triaxcal.model.directions import cube_directions, elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import reaches

@@ -21,6 +21,7 @@ from scipy.optimize import nnls
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import f_sf, t_ppf
 from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
@@ -35,7 +36,6 @@ from triaxcal.effects.contract import (
     lag_in,
     rate_of,
 )
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.effects.runs import runs_named
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration

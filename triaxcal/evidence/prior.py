@@ -1,5 +1,5 @@
-"""The prior, and from which probability on something is said or done: the
-settings of a diagnosis in one table, each with its reason."""
+"""The prior, and the probabilities that decide: the settings of a diagnosis in one
+table, each with its reason."""
 
 from __future__ import annotations
 
@@ -11,90 +11,87 @@ from triaxcal.rounding import reaches
 
 @dataclass(frozen=True)
 class Odds:
-    """Odds, probabilities and sizes before the poses were seen. A factor of 3
-    in any of them changes little where the poses are many. An odds is that of a
-    hypothesis with one more term over that without.
+    """Prior odds, probabilities and sizes. With many poses a factor of 3 in any of them
+    changes little. The odds are those of a hypothesis with one more term against the
+    hypothesis without.
 
-    Sizes are those of a whole effect: the rms of what it adds, over the sphere
-    and over the recording's range of its covariate. They mean the same for
-    every recording.
+    A size is that of a whole effect: the rms of its contribution over the sphere and
+    over the recording's range of its covariate. It means the same in every recording.
     """
 
     effect_odds: float = EFFECT_ODDS
-    """That some effect of the catalogue acts, shared evenly among the names
-    that can; a second one likewise."""
+    """Odds that some effect of the catalogue acts, shared evenly among the possible
+    names; also of a second effect."""
     pooled_effect_probability: float = 0.3
-    """That one effect acts in every one of several units, shared likewise; else
-    each unit is for itself."""
+    """Probability that one effect acts in all of several units, shared among the
+    possible names; otherwise the units are independent."""
     outlier_odds: float = 0.005
-    """That a pose is an outlier: one knock or slip in some two hundred."""
+    """Odds that a pose is an outlier: one knock or slip in some two hundred."""
     unmodelled_probability: float = 0.2
-    """That something acts that no name describes, shared evenly among its
-    kinds."""
+    """Probability that an unmodelled part acts, shared evenly among its kinds."""
     local_probability: float = 0.001
-    """That something acts near one end of an axis, or in one direction, shared
-    among these: less than one outlier, so that a single pose stays one, and more
-    than two, so that those that share a direction do not."""
+    """Probability of a local part, near one end of an axis or in one direction, shared
+    among these. It is less than that of one outlier, so a single pose stays an outlier,
+    and more than that of two, so poses in one direction are a local part."""
     change_point_odds: float = 0.005
-    """That one calibration does not hold in all poses: a unit exchanged, or its
-    channels, in one of two hundred."""
+    """Odds that one calibration does not hold in all poses: in one of two hundred
+    recordings somebody exchanges the unit or its channels."""
     largest_g: float = 30e-3
-    """A sensor that departs by more from the linear model is broken."""
+    """The largest effect: a sensor with a larger departure is broken."""
     largest_outlier: float = 1.0
-    """Of the reference, as of another unit or mounting: a pose that was moved,
-    or turned over, is off by as much."""
+    """The largest outlier or change of calibration, as a share of the reference: a
+    pose that was moved or turned over has such an error."""
     smallest: float = SMALLEST
-    """Of the noise of a pose: what is less shows in no data."""
+    """The smallest effect, in noises of a pose: no data show a smaller one."""
     sizes: int = SIZES
-    """Steps between the two, even in the logarithm: a factor of 3 to 5, within
-    which the evidence hardly changes."""
+    """Number of sizes between both, even in the logarithm: steps by a factor of 3 to 5,
+    within which the evidence hardly changes."""
     unmodelled_smallest: float = 0.4
     unmodelled_largest: float = 200.0
     unmodelled_sizes: int = 7
-    """Of an unmodelled part in standard errors of a pose: from what hardly
-    shows to what no effect exceeds."""
+    """Sizes of an unmodelled part, in standard errors of a pose: from a hardly visible
+    one to one that no effect exceeds."""
     on_one_axis: float = ON_ONE_AXIS
     on_two_axes: float = ON_TWO_AXES
-    """Of an effect with a part for each axis: usually, in the half that is
-    left, one mechanism acts on all of them."""
+    """Probabilities for an effect with a part for each axis. In the remaining half one
+    mechanism acts on all axes, as is usual."""
     certain: float = 0.99
-    """A name of this probability is adopted, and has to keep it without any one
-    pose."""
+    """Probability from which on a name is adopted. It must keep this probability
+    without any single pose."""
     reported: float = 0.5
-    """Outliers, and names that are not certain, are reported from this
-    probability on."""
+    """Probability from which on outliers and uncertain names are reported."""
     refused: float = 0.5
-    """Where an unmodelled part is likelier than not, or a name would be
-    unlikelier than not without some one pose, no effect is corrected."""
+    """No effect is corrected if an unmodelled part is more likely than this, or if a
+    name would be less likely without some single pose."""
     gain: float = 0.5
-    """Of the expected mean square of |a| under the linear model. A correction
-    that no name describes is not made where it leaves more. Half is a margin:
-    no real sensor follows the assumed covariances exactly, and memory or time
-    may look like a function of the direction."""
+    """Largest share of the expected mean square of |a| under the linear model that a
+    correction without a name may leave. Half is a margin: no real sensor follows the
+    assumed covariances exactly, and memory or time may look like a function of the
+    direction."""
     gain_by_names: float = 0.7
-    """Likewise of a correction by names none of which is certain. Of fifty
-    recordings of 14 poses with an effect that no catalogue has, three came out
-    worse, by up to five times, and all three expected more than this."""
+    """The same share for a correction by uncertain names. Of fifty recordings of 14
+    poses with an effect outside every catalogue, the correction made three worse, by
+    up to five times; all three expected more than this share."""
     another_form: float = 0.2
-    """Share of the mean square along the measured vector that is added across
-    it, because another effect may look the same in |a|."""
+    """Share of the mean square along the measured vector that is added across it:
+    another effect may look the same in |a|."""
     together: int = 3
-    """Effects and outliers at once, at most."""
+    """Maximum number of effects and outliers in a hypothesis."""
     relinearise_chi2: float = 1.0
-    """Where the likeliest effects make more of chi-square by their curvature,
-    all is linearised anew about them: so much changes no evidence by more than
-    a factor of 1.6."""
+    """Change of chi-square by the curvature of the likeliest effects from which on the
+    data are linearised again about them: this much changes no evidence by more than a
+    factor of 1.6."""
     refine_share: float = 0.98
-    """Where two neighbouring values of a shape hold so much of an effect's
-    probability, each is divided: a normal distribution of more than a third of
-    their distance has less there."""
+    """Share of an effect's probability in two neighbouring values of its shape from
+    which on both are refined: a normal distribution with a standard deviation of more
+    than a third of their distance has less there."""
     refine_count: int = 4
-    """Values in the place of one."""
+    """Number of values that replace one."""
     window: float = 1e4
-    """Sets of less probability than the best by this factor are left out
-    (Occam's window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89:1535)."""
+    """Sets that are less probable than the best by this factor are excluded (Occam's
+    window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89:1535)."""
 
     def hangs_on_one_pose(self, probability: float) -> bool:
-        """Whether a candidate of this probability would be certain, but for
-        some one pose that may be an outlier."""
+        """Whether a candidate of this probability would be certain without some single
+        pose, which may be an outlier."""
         return reaches(probability, self.certain)

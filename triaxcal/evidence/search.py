@@ -12,17 +12,17 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.effects import catalogue_for
+from triaxcal.effects.catalogue import EffectFault
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import State, linearise_all
 from triaxcal.estimate.recordings import by_run
+from triaxcal.evidence.covariances import inverse_of
 from triaxcal.evidence.likelihood import Evidence, SetEvidence
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.row_covariance import inverse_of
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose

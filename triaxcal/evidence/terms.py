@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints, evenly_spread
+from triaxcal.effects.catalogue import EffectFault, is_plugin
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.odds import AXES, on_axes
-from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
@@ -256,7 +256,7 @@ def faults_of(rows: LinearisedData, catalogue: Sequence[Effect]) -> dict[str, st
     known, covariates = rows.problem.channel_reference, rows.problem.covariates
     s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates)
     for effect in catalogue:
-        if is_foreign(effect) and all(n in known for n in effect.needs):
+        if is_plugin(effect) and all(n in known for n in effect.needs):
             try:
                 for variant in effect.variants(covariates):
                     variant.basis(s, covariates)
@@ -315,7 +315,7 @@ def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | No
     try:
         columns = rows.by_coefficients(effect)
         covariates = rows.problem.covariates
-        if is_foreign(effect):  # it may not know its slope
+        if is_plugin(effect):  # it may not know its slope
             effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates), covariates)
         up, some = spiral(SPHERE) * rows.problem.reference, evenly_spread(np.arange(rows.n), SIZE_POSES)
         every: Mapping[str, Floats] = {name: np.repeat(values[some], len(up)) for name, values in covariates.items()}

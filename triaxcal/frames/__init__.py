@@ -2,10 +2,9 @@
 rotation, with the fixture's own errors."""
 
 from triaxcal.frames.faces import LABELS, TURNS, Labelling, Miscounted, axis_of, labelled, opposite, recognise
-from triaxcal.frames.fixture import Fixture, Quantity
 from triaxcal.frames.orientations import Assumed, Verticals, verticals, verticals_under
 from triaxcal.frames.standing import Standing, stand
-from triaxcal.frames.unit_frames import Datum, Frames, UnitFrame, frames
+from triaxcal.frames.unit_frames import Datum, Fixture, Frames, Quantity, UnitFrame, frames
 
 __all__ = [
     "LABELS",

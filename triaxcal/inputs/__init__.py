@@ -3,8 +3,8 @@
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
 from triaxcal.inputs.bias_update import Earlier, require_known, updated_biases
 from triaxcal.inputs.datasheet import Datasheet, Refinement, refine
-from triaxcal.inputs.turning.moments import Moments
-from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
+from triaxcal.inputs.moments import Moments
+from triaxcal.inputs.rotation import RotationFit, fit_rotation
 
 __all__ = [
     "AttitudeFit",

@@ -39,8 +39,7 @@ from triaxcal.frames.faces import nearest_rotation
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, lack_of_fit_p, within_pose_dof
-from triaxcal.poses.pose import Pose, PoseStart
-from triaxcal.poses.pose_in_words import the_poses
+from triaxcal.poses.pose import Pose, PoseStart, the_poses
 
 # Cautions of a fit to poses of known attitude.
 

@@ -36,9 +36,9 @@ from triaxcal.estimate.calibration import (
     studentized,
 )
 from triaxcal.estimate.creep import with_unexplained_creep
-from triaxcal.model.bias_directions import (
-    DILUTION_LIMIT,
-    LEAST,
+from triaxcal.model.directions import (
+    BIAS_DILUTION_LIMIT,
+    BIAS_POSES,
     bias_dilution,
     determined,
     distinct_directions,
@@ -51,8 +51,8 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, SIGNIFICANT, lack_of_fit_p, within_pose_dof
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import probability
-from triaxcal.uncertainty.another_day import START_TO_START
-from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K
+from triaxcal.uncertainty.combined import START_TO_START
+from triaxcal.uncertainty.components import SENSITIVITY_PER_K
 
 SCALE_FACTOR_SHARE = 0.1
 """Relative change of the scale factors from recording to recording, as a share of
@@ -168,13 +168,13 @@ def _chosen(poses: Sequence[Pose], c: Calibration, first: int | None) -> list[Po
     rows = list(range(len(poses))) if first is None else first_distinct(up, first)
     up = up[rows]
     many = distinct_directions(up)
-    if many < LEAST:
+    if many < BIAS_POSES:
         short = number_of(many, "distinct still pose")
-        raise Refused(f"{short}; three biases need at least {LEAST}, 4 are better", wanted=wanted_for_biases(up))
+        raise Refused(f"{short}; three biases need at least {BIAS_POSES}, 4 are better", wanted=wanted_for_biases(up))
     if not determined(up):
         raise Refused(
             f"{many} distinct still poses do not determine three biases: some combination of them would be "
-            f"{bias_dilution(up):.3g} times as uncertain as one pose (limit {DILUTION_LIMIT:g})",
+            f"{bias_dilution(up):.3g} times as uncertain as one pose (limit {BIAS_DILUTION_LIMIT:g})",
             wanted=wanted_for_biases(up),
         )
     return [poses[i] for i in rows]

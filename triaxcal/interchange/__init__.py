@@ -1,5 +1,5 @@
-"""How values look to others: JSON documents written and read, and samples as
-arrays or tables."""
+"""Values in the formats of other programs: JSON documents, written and read, and
+samples as arrays or tables."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -8,31 +8,35 @@ from triaxcal.interchange.calibration_document import (
     WEIGHT,
     Document,
     assumed_in,
+    attitudes_document,
     budget_document,
     calibration_document,
     coefficients_document,
+    datasheet_document,
     holds_of,
     poses_document,
     residual_document,
+    turning_document,
 )
 from triaxcal.interchange.calibration_reading import (
     but_is,
     calibration_of,
     calibration_part,
+    correlation_of,
+    effect_errors_of,
     expanded_uncertainty_in,
     holds_at_of,
+    linear_errors_of,
     logged_in,
     reference_unit_in,
     sensor_of,
 )
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.interchange.method_documents import attitudes_document, datasheet_document, turning_document
 
 if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
 
 _LATER = ("agreement_document", "with_recordings")
-"""They import the diagnosis, which most commands do without."""
+"""They import the diagnosis, which most commands do not need."""
 
 __all__ = [
     "WEIGHT",

@@ -1,5 +1,8 @@
-"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that
-others script against."""
+"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that others
+script against.
+
+A method other than still poses adds its results under a key of its own.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,9 @@ from triaxcal.estimate.calibration import (
     Residual,
     Unmodelled,
 )
+from triaxcal.inputs.attitude import AttitudeFit
+from triaxcal.inputs.datasheet import Refinement
+from triaxcal.inputs.rotation import RotationFit
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -31,20 +37,20 @@ from triaxcal.rounding import (
     uncertainty,
 )
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcal.uncertainty.another_day import NextRecording, Scopes, next_recording
+from triaxcal.uncertainty.combined import NextRecording, Scopes, next_recording
 from triaxcal.uncertainty.statements import Basis, UnmodelledTemperature
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
-LINEAR = ("scale_factor", "misalignment", "bias")
+GROUPS = ("scale_factor", "misalignment", "bias")
 WEIGHT = "weight"
-"""Beside the coefficients of an effect, where predictions average models: by
-which share they count."""
+"""The key of an effect's weight in a model average, next to its coefficients."""
 _LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
-"""As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
+"""The values of documents of 0.1, next to ``excluded``; else the name of the fault."""
 
 
 def poses_document(poses: Sequence[Pose]) -> Document:
+    """`triaxcal.poses/1`."""
     return {
         "format": "triaxcal.poses/1",
         "poses": [
@@ -62,6 +68,7 @@ def poses_document(poses: Sequence[Pose]) -> Document:
 
 
 def residual_document(residual: Residual, reference: float = 1.0) -> Document:
+    """The residual block, rounded for the magnitude of the reference."""
     return {
         "rms_g": error(residual.rms_g, reference),
         "max_abs_g": error(residual.max_abs_g, reference),
@@ -74,7 +81,7 @@ def residual_document(residual: Residual, reference: float = 1.0) -> Document:
 
 
 def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, str]], reference_unit: str) -> Document:
-    """Of one effect; null for a standard error that the poses do not tell."""
+    """The coefficients of one effect; null for an undetermined standard error."""
     return {
         name: {
             "value": number(value),
@@ -86,8 +93,8 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
 
 
 def holds_of(c: Calibration) -> list[str]:
-    """In words, under which conditions scale factor, misalignment and bias are
-    all of a reading; none where always."""
+    """The conditions, in words, under which scale factor, misalignment and bias are the
+    whole model; empty without effects."""
     several = any(p.pose.run.of > 1 for p in c.poses)
     return list(text.holds([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
 
@@ -100,18 +107,19 @@ def calibration_document(
     stated: Stated | None = None,
     budgeted: bool = True,
 ) -> Document:
-    """``reference_unit`` names the unit of the reference vector; keys keep
-    their ``_g`` whatever it is. ``stated`` are uncertainties that no recording
-    can tell. ``budgeted``: with the budget, which is that of a fit to still
-    poses."""
+    """`triaxcal.calibration/1`.
+
+    ``reference_unit`` names the unit of the reference vector; keys keep their ``_g``
+    in any unit. ``stated`` has uncertainties that no recording shows. ``budgeted`` adds
+    the budget, which exists for a fit to still poses."""
     errors = dict(zip(c.parameters, c.standard_errors, strict=True))
     evaluated = budget(c, stated) if budgeted else None
 
     def group(name: str) -> list[Any]:
         return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
 
-    def linear_only(of: Calibration) -> Document:
-        return calibration_document(of, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
+    def linear_only(linear: Calibration) -> Document:
+        return calibration_document(linear, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
 
     return {
         "format": "triaxcal.calibration/1",
@@ -132,7 +140,7 @@ def calibration_document(
             | ({WEIGHT: chance(c.weights[effect.name])} if effect.name in c.weights else {})
             for effect, _ in c.sensor.effects
         },
-        "standard_error": {name: group(name) for name in LINEAR},
+        "standard_error": {name: group(name) for name in GROUPS},
         "parameters": list(c.parameters),
         "correlation": correlation(c.covariance),
         **({} if c.unmodelled is None else {"unmodelled": _unmodelled(c.unmodelled)}),
@@ -206,13 +214,13 @@ def _pose_result(p: PoseResult, reference: float) -> Document:
 
 
 def _scopes(c: Calibration, evaluated: Budget) -> Document:
-    """Of |a|, by the readings that it is of."""
+    """Expanded uncertainties of |a|, by the readings for which they hold."""
     scopes = Scopes.of(c, evaluated, next_recording(c, evaluated))
     return {name.replace("'", "").replace(" ", "_"): uncertainty(value) for name, value in scopes.named.items()}
 
 
 def _unmodelled(part: Unmodelled) -> Document:
-    """Beside the standard errors and their correlation."""
+    """Uncertainty in addition to the standard errors and their correlation."""
     return {"along_g": uncertainty(part.along), "across_g": uncertainty(part.across)}
 
 
@@ -232,30 +240,29 @@ def next_recording_document(following: NextRecording) -> Document:
 
 
 def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
-    """Values in the order of `Calibration.parameters`, in groups as the
-    coefficients stand in a document."""
-    held = dict(zip(c.parameters, values, strict=True))
-    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
-    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+    """Values in the order of `Calibration.parameters`, in the groups of a document."""
+    by_name = dict(zip(c.parameters, values, strict=True))
+    groups: Document = {name: [by_name[f"{name}.{axis}"] for axis in "xyz"] for name in GROUPS}
+    effects = {e.name: {k.name: by_name[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
     return groups | ({"effects": effects} if effects else {})
 
 
 def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Document:
-    """Expanded uncertainties and where they come from. Standard uncertainties
-    in the budget's lines."""
+    """Expanded uncertainties and their components; the lines of the budget have
+    standard uncertainties."""
 
     def by_name(values: Floats) -> Document:
         return by_parameter(c, [uncertainty(float(v)) for v in values])
 
-    whole, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
+    magnitude, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
     return {
         "level": b.parameters.level,
         "expanded": by_name(b.parameters.expanded),
         "coverage_factor": by_name(b.parameters.coverage),
         "magnitude": {
-            "standard_g": uncertainty(float(whole.standard)),
-            "coverage_factor": uncertainty(float(whole.coverage)),
-            "expanded_g": uncertainty(float(whole.expanded)),
+            "standard_g": uncertainty(float(magnitude.standard)),
+            "coverage_factor": uncertainty(float(magnitude.coverage)),
+            "expanded_g": uncertainty(float(magnitude.expanded)),
         },
         "budget": [
             {
@@ -278,6 +285,85 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
 
 
 def assumed_in(basis: Basis) -> tuple[str, ...]:
-    """The effects whose size a line of the budget
-    (`triaxcal.uncertainty.Component`) assumes."""
+    """The effects with an assumed size in a component of the budget
+    (`triaxcal.uncertainty.Component`)."""
     return basis.effects if isinstance(basis, UnmodelledTemperature) and not basis.stated else ()
+
+
+# Documents of calibrations by other methods than still poses of unknown attitude.
+
+
+def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
+    """A calibration from a turning unit."""
+    document = calibration_document(
+        found.calibration, output_unit=output_unit, reference_unit=reference_unit, budgeted=False
+    )
+    t = found.temperature
+    document["temperature_c"] = (
+        None if t is None else {"mean": number(t.mean), "lowest": number(t.lowest), "highest": number(t.highest)}
+    )
+    document["samples"] = found.samples
+    document["stretches"] = found.stretches
+    document["noise_g"] = numbers(found.noise_g, UNCERTAINTY_DIGITS)
+    document["noise_unseen_share"] = uncertainty(found.unseen_share)
+    return document
+
+
+def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: str) -> Document:
+    """A calibration from known attitudes."""
+    c = found.calibration
+    document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
+    document["attitudes"] = {
+        "error_rad": uncertainty(found.attitude_error_rad),
+        "estimated": found.estimated,
+        "error_standard_error_rad": uncertainty(found.attitude_error_uncertainty_rad),
+        "if_estimated": None if found.if_estimated is None else _if_estimated(found.if_estimated),
+        "rotation": numbers(found.rotation),
+        "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
+        "standard_error_if_exact": {
+            name: numbers(found.noise_error[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(GROUPS)
+        },
+        "rows": [
+            {
+                "name": row.name,
+                "up": numbers(row.up),
+                "off_rad": uncertainty(row.off_rad),
+                "off_standard_errors": uncertainty(row.off),
+                "used": pose.used,
+            }
+            for row, pose in zip(found.attitudes, c.poses, strict=True)
+        ],
+    }
+    return document
+
+
+def _if_estimated(found: AttitudeFit) -> Document:
+    c = found.calibration
+    return {
+        "error_rad": uncertainty(found.attitude_error_rad),
+        "error_standard_error_rad": uncertainty(found.attitude_error_uncertainty_rad),
+        **{name: numbers(getattr(c.sensor, name)) for name in GROUPS},
+        "standard_error": {
+            name: numbers(c.standard_errors[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(GROUPS)
+        },
+        "rotation": numbers(found.rotation),
+        "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
+        "residual": residual_document(c.residual, c.reference),
+    }
+
+
+def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:
+    """A refinement of datasheet values."""
+    c = found.calibration
+    document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
+    document["passport"] = {
+        "conflict_p": probability(found.conflict_p),
+        "changed": [c.parameters[i] for i in found.changed],
+        "changed_alone": found.changed_alone if found.changed else None,
+        "value": by_parameter(c, [number(float(v)) for v in found.datasheet.values]),
+        "standard_error": by_parameter(c, [uncertainty(float(v)) for v in found.datasheet.standard_error]),
+        "shift_standard_errors": by_parameter(c, [uncertainty(float(v)) for v in found.shift]),
+        "share_of_poses": by_parameter(c, [uncertainty(float(v)) for v in found.share]),
+        "source": by_parameter(c, found.sources),
+    }
+    return document

@@ -1,25 +1,93 @@
-"""The sensor that a document holds, of whoever wrote it: read with errors that
-name the file and the field."""
+"""Reading of a calibration document, of any writer: the sensor, its errors, and the
+prior of a bias update. Errors name the file and the field.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects import Effect, effect_of
+from triaxcal.effects import TEMPERATURE, Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.calibration import Calibration, ReferenceEpoch, Residual, Unmodelled
-from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.estimate.calibration import Calibration, Origin, ReferenceEpoch, Residual, Unmodelled
+from triaxcal.inputs.bias_update import Earlier
+from triaxcal.interchange.calibration_document import GROUPS, WEIGHT
 from triaxcal.model.samples import Moment
-from triaxcal.model.sensor import Sensor
+from triaxcal.model.sensor import LINEAR, Sensor
+from triaxcal.uncertainty.combined import Source
 from triaxcal.units import reference_unit_of
+
+# The errors of a calibration in its document: standard errors and correlations.
+
+ROUNDED = 1e-4
+"""Tolerance of correlations: documents round them to a millionth, so the smallest
+eigenvalue may be below zero."""
+
+
+def linear_errors_of(part: Mapping[str, Any], *, where: str) -> Floats:
+    """(9,) standard errors of scale factors, misalignments and biases. Raises
+    InvalidData."""
+    errors = part.get("standard_error")
+    out = []
+    for name in GROUPS:
+        values = _numbers(errors.get(name) if isinstance(errors, Mapping) else None)
+        if values.shape != (3,) or not np.all(values >= 0):
+            raise InvalidData(f"{where}: standard_error.{name}: expected three numbers of at least 0")
+        out.append(values)
+    return np.concatenate(out)
+
+
+def effect_errors_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats:
+    """(p,) standard errors of the effects' coefficients. Raises InvalidData."""
+    out = []
+    for effect, _ in sensor.effects:
+        for k in effect.coefficients:
+            value = _numbers(part["effects"][effect.name][k.name].get("standard_error"))
+            if value.shape or not value >= 0:
+                name = f"effects.{effect.name}.{k.name}.standard_error"
+                raise InvalidData(f"{where}: {name}: expected a number of at least 0")
+            out.append(float(value))
+    return np.array(out)
+
+
+def correlation_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats | None:
+    """The correlation matrix (9+p,9+p) in the order of `Calibration.parameters`; None
+    if the document has none. Raises InvalidData.
+
+    Values without a standard error have no correlation: zeros.
+    """
+    if "correlation" not in part:
+        return None
+    expected = [f"{name}.{axis}" for name in GROUPS for axis in "xyz"]
+    expected += [f"{effect.name}.{k.name}" for effect, _ in sensor.effects for k in effect.coefficients]
+    names = part.get("parameters", expected)
+    if not isinstance(names, list) or sorted(map(str, names)) != sorted(expected):
+        raise InvalidData(f"{where}: parameters: expected the names of all {len(expected)} coefficients")
+    matrix = _numbers(part["correlation"])
+    n = len(expected)
+    sound = matrix.shape == (n, n) and np.all(np.abs(matrix) <= 1 + ROUNDED)
+    sound = sound and np.all(np.abs(matrix - matrix.T) <= ROUNDED)
+    if not sound or np.linalg.eigvalsh(matrix)[0] < -ROUNDED * n:
+        raise InvalidData(f"{where}: correlation: expected a correlation matrix of {n} rows")
+    order = [names.index(name) for name in expected]
+    return np.asarray(matrix[np.ix_(order, order)])
+
+
+def _numbers(value: object) -> Floats:
+    """The values as an array of finite numbers, else an empty one."""
+    try:
+        out = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
+    return out if np.isfinite(out).all() else np.zeros(0)
+
 
 _WITH_CALIBRATION = ("triaxcal.calibration/1", "triaxcal.loop/1", "triaxcal.certificate/1")
 
@@ -40,22 +108,22 @@ def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str,
 
 
 def but_is(document: Mapping[str, Any]) -> str:
-    """For the end of a message: which format a document has, where it says."""
-    named = document.get("format")
-    return f", not {named}" if isinstance(named, str) and re.fullmatch(r"[\w.-]{1,40}/\d{1,4}", named) else ""
+    """The end of a message: the format that a document names, if it does."""
+    name = document.get("format")
+    return f", not {name}" if isinstance(name, str) and re.fullmatch(r"[\w.-]{1,40}/\d{1,4}", name) else ""
 
 
 def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:
-    """The unit of the reference that a calibration document says, or what it
-    must be by its magnitude."""
+    """The unit of the reference in a calibration document, else the likely unit for
+    its magnitude."""
     units = calibration_part(document, where=where).get("units")
-    said = units.get("reference") if isinstance(units, Mapping) else None
-    return said if isinstance(said, str) and said else reference_unit_of(magnitude)
+    name = units.get("reference") if isinstance(units, Mapping) else None
+    return name if isinstance(name, str) and name else reference_unit_of(magnitude)
 
 
 def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
-    """The channels of the poses of a calibration document that were used, (n,)
-    each, as covariates are named; none that one of these lacks."""
+    """The channels (n,) that all used poses of a calibration document have, by the
+    name of their covariate."""
     poses = calibration_part(document, where=where).get("poses")
     used = [p for p in poses if isinstance(p, Mapping) and p.get("used", True)] if isinstance(poses, list) else []
     found = [p.get("channels") for p in used]
@@ -65,7 +133,8 @@ def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
 
 
 def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float | None:
-    """Of |a|, in the unit of the reference; None where the document has none."""
+    """The expanded uncertainty of |a| in the unit of the reference; None if the
+    document has none."""
     found: Any = calibration_part(document, where=where)
     for key in ("uncertainty", "magnitude", "expanded_g"):
         found = found.get(key) if isinstance(found, Mapping) else None
@@ -74,7 +143,7 @@ def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float
 
 
 def _floats(value: Any) -> Floats:
-    """Raises ValueError for what is no number in JSON."""
+    """An array of JSON numbers. Raises ValueError for other values."""
     found = np.asarray(value)
     if found.dtype.kind not in "iuf":
         raise ValueError(f"{value!r} is no number")
@@ -85,15 +154,16 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
     """Sensor, channel references and reference magnitude of a calibration
     document. Raises InvalidData."""
     part = calibration_part(document, where=where)
+    # The values, as far as they are numbers.
     try:
         k, m, b = (_floats(part[name]) for name in ("scale_factor", "misalignment", "bias"))
         effects = []
-        for name, held in part.get("effects", {}).items():
-            values = {n: float(_floats(v["value"])) for n, v in held.items() if n != WEIGHT}
+        for name, entry in part.get("effects", {}).items():
+            values = {n: float(_floats(v["value"])) for n, v in entry.items() if n != WEIGHT}
             effect, q = effect_of(name, values)
-            lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
-            if lacking:
-                raise KeyError(f"effects.{name}.{lacking[0]}")
+            missing = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in entry]
+            if missing:
+                raise KeyError(f"effects.{name}.{missing[0]}")
             effects.append((effect, q))
         reference = {str(n): float(v) for n, v in part.get("channel_reference", {}).items()}
         magnitude = float(part.get("reference", 1.0))
@@ -101,22 +171,23 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         raise InvalidData(f"{where}: {e.args[0]}: missing, or no effect of that name is known") from e
     except (TypeError, ValueError, AttributeError, OverflowError) as e:
         raise InvalidData(f"{where}: not numbers where numbers belong ({e})") from e
+    # Their shapes, and the effects of the model.
     if any(v.shape != (3,) or not np.isfinite(v).all() for v in (k, m, b)) or not np.all(k):
         raise InvalidData(
             f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
         )
-    named = part.get("terms")
-    terms = set(map(str, named)) - {"linear"} if isinstance(named, list) else set()
-    if terms and not effects:  # without its effects a matrix is another calibration
+    listed = part.get("terms")
+    terms = set(map(str, listed)) - {"linear"} if isinstance(listed, list) else set()
+    if terms and not effects:  # the matrix alone is another calibration
         raise InvalidData(f"{where}: effects: no coefficients of {', '.join(sorted(terms))}, which terms has")
     _require_finite(effects, reference, magnitude, where)
     return Sensor(k, m, b, tuple(effects)), reference, magnitude
 
 
 def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
-    """The calibration in a calibration, loop or certificate document, as the
-    model of other poses. What only its fit could tell is not a number, and so
-    is a covariance that the document does not hold. Raises InvalidData."""
+    """The calibration in a calibration, loop or certificate document, as the model for
+    other poses. Figures of the fit alone are NaN, as is a covariance that the document
+    lacks. Raises InvalidData."""
     part = calibration_part(document, where=where)
     sensor, channel_reference, magnitude = sensor_of(document, where=where)
     unknown = math.nan
@@ -132,7 +203,9 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
         birge_ratio=unknown,
         dof=unknown,
         weights={
-            name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := number_in(held.get(WEIGHT)))
+            name: w
+            for name, entry in part.get("effects", {}).items()
+            if math.isfinite(w := number_in(entry.get(WEIGHT)))
         },
         unmodelled=unmodelled_of(part, where=where),
         holds_at=holds_at_of(part, where=where),
@@ -140,15 +213,14 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
 
 
 def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats:
-    """(p,p) of the parameters; not numbers where the document has no standard
-    errors. Without a correlation they count as independent. Raises
-    InvalidData."""
+    """The covariance (p,p) of the parameters; NaN if the document has no standard
+    errors. Without a correlation they count as independent. Raises InvalidData."""
     n = 9 + sum(len(q) for _, q in sensor.effects)
     if not isinstance(part.get("standard_error"), Mapping):
         return np.full((n, n), math.nan)
-    held = [part["effects"][e.name][k.name] for e, _ in sensor.effects for k in e.coefficients]
-    if any(isinstance(v, Mapping) and v.get("standard_error") is None for v in held):
-        return np.full((n, n), math.nan)  # only a combination of coefficients is known
+    coefficients = [part["effects"][e.name][k.name] for e, _ in sensor.effects for k in e.coefficients]
+    if any(isinstance(v, Mapping) and v.get("standard_error") is None for v in coefficients):
+        return np.full((n, n), math.nan)  # the poses determined a combination of coefficients alone
     sigma = np.concatenate([linear_errors_of(part, where=where), effect_errors_of(part, sensor, where=where)])
     correlation = correlation_of(part, sensor, where=where)
     if correlation is None:
@@ -157,25 +229,26 @@ def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Flo
 
 
 def unmodelled_of(part: Mapping[str, Any], *, where: str) -> Unmodelled | None:
-    """Raises InvalidData."""
-    held = part.get("unmodelled")
-    if held is None:
+    """The unmodelled part, None if there is none. Raises InvalidData."""
+    block = part.get("unmodelled")
+    if block is None:
         return None
-    along, across = (number_in(held.get(k)) if isinstance(held, Mapping) else math.nan for k in ("along_g", "across_g"))
+    known = block if isinstance(block, Mapping) else {}
+    along, across = (number_in(known.get(k)) for k in ("along_g", "across_g"))
     if not (0 <= along < math.inf and 0 <= across < math.inf):
         raise InvalidData(f"{where}: unmodelled: expected along_g and across_g, numbers of at least 0")
     return Unmodelled(along, across)
 
 
 def holds_at_of(part: Mapping[str, Any], *, where: str) -> ReferenceEpoch | None:
-    """None where the document, as those of 0.1, does not say. Raises
+    """The reference epoch; None in a document without one, as those of 0.1. Raises
     InvalidData."""
-    held = part.get("holds_at")
-    if held is None:
+    epoch = part.get("holds_at")
+    if epoch is None:
         return None
     try:
-        moment, t_s = Moment(held["moment"]), float(held["t_s"])
-        time_s = float(held.get("since_middle_s", t_s))
+        moment, t_s = Moment(epoch["moment"]), float(epoch["t_s"])
+        time_s = float(epoch.get("since_middle_s", t_s))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError):
         t_s = time_s = math.nan
     if not math.isfinite(t_s + time_s):
@@ -184,8 +257,8 @@ def holds_at_of(part: Mapping[str, Any], *, where: str) -> ReferenceEpoch | None
 
 
 def _residual(part: Mapping[str, Any]) -> Residual:
-    held = part.get("residual")
-    found = held if isinstance(held, Mapping) else {}
+    block = part.get("residual")
+    found = block if isinstance(block, Mapping) else {}
     optional = ("cross_validated_rms_g", "lack_of_fit_p", "weighted_rms", "reduced_chi2")
     known = {name: None if math.isnan(v := number_in(found.get(name))) else v for name in optional}
     return Residual(
@@ -197,14 +270,14 @@ def _residual(part: Mapping[str, Any]) -> Residual:
 
 
 def number_in(value: object) -> float:
-    """NaN for what is no number."""
+    """The number, NaN for any other value."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
 def _require_finite(
     effects: Sequence[tuple[Effect, Floats]], reference: Mapping[str, float], magnitude: float, where: str
 ) -> None:
-    """JSON as Python reads it has NaN."""
+    """Raises InvalidData. Python's JSON reader accepts NaN."""
     for effect, values in effects:
         if not np.isfinite(values).all():
             raise InvalidData(f"{where}: effects.{effect.name}: expected finite numbers")
@@ -219,8 +292,8 @@ def _require_finite(
 
 
 def uncertainty_over_error(budget: Mapping[str, Any], c: Calibration) -> Floats:
-    """(p,) standard uncertainties of the parameters by a document's ``budget``
-    over their standard errors; 1 where either is not known."""
+    """(p,) ratios of the standard uncertainties of the parameters in a document's
+    ``budget`` to their standard errors; 1 if either is unknown."""
     out = []
     for name, error in zip(c.parameters, c.standard_errors, strict=True):
         expanded, coverage = (_in_budget(budget, key, name) for key in ("expanded", "coverage_factor"))
@@ -229,10 +302,56 @@ def uncertainty_over_error(budget: Mapping[str, Any], c: Calibration) -> Floats:
 
 
 def _in_budget(budget: Mapping[str, Any], key: str, parameter: str) -> float | None:
-    """A figure of the budget by parameter, None where it has none."""
+    """A figure of the budget for a parameter, None if it is missing."""
     group, _, name = parameter.rpartition(".")
     try:
-        of = budget[key]
-        return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
+        figures = budget[key]
+        return float(figures[group]["xyz".index(name)] if group in GROUPS else figures["effects"][group][name])
     except (LookupError, TypeError, ValueError):
         return None
+
+
+# A calibration document as the prior of a bias update (`triaxcal.inputs.bias_update`).
+
+
+def earlier_in(document: Mapping[str, Any], origin: Origin, *, where: str) -> Earlier:
+    """The earlier calibration in a calibration, loop or certificate document. Its
+    covariance contains the budget's components in addition to the fit. Raises
+    InvalidData."""
+    part = calibration_part(document, where=where)
+    fitted = calibration_of(part, where=where)
+    budget, following = part.get("uncertainty"), part.get("next_recording")
+    ratio = uncertainty_over_error(budget if isinstance(budget, Mapping) else {}, fitted)
+    predicted = following if isinstance(following, Mapping) else {}
+    start_to_start = number_in(predicted.get("start_to_start_g"))
+    blind_to, linear = part.get("blind_to"), part.get("linear_only")
+    temperature_c = logged_in(part, where=where).get(TEMPERATURE)
+    scatter, dof, noise = _scatter(part)
+    return Earlier(
+        replace(fitted, blind_to=tuple(map(str, blind_to)) if isinstance(blind_to, list) else ()),
+        fitted.covariance * np.outer(ratio, ratio),
+        scatter_g=scatter,
+        residual_dof=dof,
+        noise_g=noise,
+        start_to_start=start_to_start if start_to_start >= 0 else None,
+        measured=predicted.get("source") == Source.MEASURED.value,
+        temperatures_c=None if temperature_c is None else (float(temperature_c.min()), float(temperature_c.max())),
+        origin=origin,
+        linear_only=earlier_in(linear, origin, where=f"{where}: linear_only") if isinstance(linear, Mapping) else None,
+    )
+
+
+def _scatter(part: Mapping[str, Any]) -> tuple[float, float, float]:
+    """From the residuals: the excess standard deviation of |a| in a pose, its degrees
+    of freedom, and the standard deviation with the noise. An update passes on the
+    excess of its earlier calibration, as its few poses determine little of it."""
+    residual, updated, poses = (part.get(name) for name in ("residual", "rezero", "poses"))
+    figures = residual if isinstance(residual, Mapping) else {}
+    used = sum(bool(p.get("used", True)) for p in poses if isinstance(p, Mapping)) if isinstance(poses, list) else 0
+    if isinstance(updated, Mapping):
+        known, dof = (max(number_in(updated.get(name)), 0.0) for name in ("scatter_g", "scatter_dof"))
+        return known, dof, number_in(figures.get("rms_g")) * math.sqrt(used / max(used - 3, 1))
+    left = max(used - LINEAR, 0)
+    variance = number_in(figures.get("rms_g")) ** 2 * used / left if left else math.nan
+    excess = variance - number_in(figures.get("noise_floor_g")) ** 2
+    return (math.sqrt(excess) if excess > 0 else 0.0), float(left), math.sqrt(variance)

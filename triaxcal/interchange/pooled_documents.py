@@ -1,5 +1,5 @@
-"""Several recordings in one diagnosis: of one unit, or of several units side by
-side (`triaxcal.agreement/1`)."""
+"""Several recordings in one diagnosis: of one unit, or of several units
+(`triaxcal.agreement/1`)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from triaxcal.rounding import chance, error, number, uncertainty
 from triaxcal.text.pooled_units import verdict
 from triaxcal.units import in_units_of
 
-NO_LONGER_OF_AN_EFFECT = ("worse", "gain", "units_gain", "shown_by")
-"""Keys of 0.1 that mean nothing since effects have probabilities: others read
-them, and find null."""
+OBSOLETE_KEYS = ("worse", "gain", "units_gain", "shown_by")
+"""Keys of 0.1 without a meaning since effects have probabilities. They stay, with
+null, for programs that read them."""
 
 
 def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Document:
-    """A `triaxcal.loop/1` of several recordings: which pose is of which, and
-    the residual of each."""
+    """A `triaxcal.loop/1` of several recordings, with the recording of each pose and
+    the residual of each recording."""
     by_recording = [
         {
             "recording": name,
@@ -41,8 +41,8 @@ def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Doc
 def agreement_document(
     found: PooledAnalysis, names: Sequence[str], results: Sequence[Document], reference_unit: str = "g"
 ) -> Document:
-    """``results`` are the units' own, `triaxcal.loop/1`, and ``names`` their
-    recordings."""
+    """`triaxcal.agreement/1`. ``results`` are the units' own documents,
+    `triaxcal.loop/1`, and ``names`` their recordings."""
     return {
         "format": "triaxcal.agreement/1",
         "verdict": verdict(found),
@@ -60,7 +60,7 @@ def _effect(c: PooledEffect, names: Sequence[str], reference_unit: str) -> Docum
     def recordings(indices: Sequence[int]) -> list[str]:
         return [names[i] for i in indices]
 
-    silent = [i for i in range(len(names)) if i not in (*c.named, *c.listed)]
+    without = [i for i in range(len(names)) if i not in (*c.named, *c.listed)]
     return {
         "effect": c.effect,
         "probability": chance(c.probability),
@@ -68,9 +68,9 @@ def _effect(c: PooledEffect, names: Sequence[str], reference_unit: str) -> Docum
         "units_probability": [chance(p) for p in c.units],
         "named_by": recordings(c.named),
         "listed_by": recordings(c.listed),
-        "not_found_by": recordings(silent),
+        "not_found_by": recordings(without),
         "shapes": {name: _shape(shape, names, reference_unit) for name, shape in c.shapes.items()},
-        **dict.fromkeys(NO_LONGER_OF_AN_EFFECT),
+        **dict.fromkeys(OBSOLETE_KEYS),
     }
 
 

@@ -1,5 +1,5 @@
-"""Samples as callers have them: arrays, or a DataFrame of pandas or polars,
-which neither is needed for."""
+"""Samples from arrays, or from a DataFrame of pandas or polars; neither package is
+needed."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")
 NO_ROLES = frozenset(
     ("x", "y", "z", "ax", "ay", "az", "u_x", "u_y", "u_z", "acc_x", "acc_y", "acc_z", "time", "timestamp", "time_s")
 )
-"""Names that are meant as those of time or outputs, and would be channels."""
+"""Names that mean time or outputs, and would count as channels."""
 _UNIT_IN_NAME = re.compile(
     r"(?:^|[^a-z])(ms|msecs?|millis\w*|[uµ]s|usecs?|micros\w*|ns|nsecs?|nanos\w*)[^a-z]*$", re.IGNORECASE
 )
 SECONDS_MOST = 9.2e9
-"""Seconds that nanoseconds in 64 bits can count, from 1970 or from the first
-sample."""
+"""The largest time in seconds that 64 bits of nanoseconds hold, from 1970 or from the
+first sample."""
 
 
 def is_table(value: object) -> bool:
-    """Whether it has named columns, as a DataFrame has. Raises InvalidData for
-    one that is not computed yet."""
+    """Whether a value has named columns, as a DataFrame has. Raises InvalidData for a
+    lazy one."""
     if hasattr(value, "collect") and not hasattr(value, "__len__"):
         raise InvalidData("a lazy table: collect it first")
     return hasattr(value, "columns") and hasattr(value, "__getitem__") and not isinstance(value, np.ndarray)
 
 
 def names_of(table: Any) -> list[str]:
+    """The names of the columns. Raises InvalidData for equal ones."""
     names = [str(name) for name in _keys(table)]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InvalidData(f"the table has two columns {twice}")
@@ -46,8 +47,8 @@ def names_of(table: Any) -> list[str]:
 
 
 def column(table: Any, name: str) -> Any:
-    """(n,) as numpy has it, of a column or of the index of that name. Raises
-    InvalidData where there is none."""
+    """The column of that name, or the index, as an array (n,). Raises InvalidData if
+    there is none."""
     if name not in names_of(table):
         if str(getattr(getattr(table, "index", None), "name", "")) == name:
             return np.asarray(table.index)
@@ -59,14 +60,13 @@ def column(table: Any, name: str) -> Any:
 
 
 def _keys(table: Any) -> Iterable[Any]:
-    """Of an Arrow table ``columns`` are the columns themselves."""
+    """The keys of the columns. An Arrow table has other ``columns``, their values."""
     return table.column_names if hasattr(table, "column_names") else table.columns  # type: ignore[no-any-return]
 
 
 def called(columns: Mapping[str, str] | None) -> dict[str, str]:
-    """The names that a table has for t_s, ux, uy, uz and the channels that
-    ``columns`` names, by ours. Raises InvalidData for names that are meant as
-    one of these and are none."""
+    """The table's names of t_s, ux, uy, uz and of the channels in ``columns``, by our
+    names. Raises InvalidData for a name in `NO_ROLES`."""
     if unknown := next((ours for ours in columns or {} if ours in NO_ROLES), None):
         raise InvalidData(f"columns: {unknown} is no role; expected t, ux, uy, uz, or the name a channel is to have")
     return {name: name for name in (TIME_COLUMN, *OUTPUTS)} | {
@@ -75,16 +75,16 @@ def called(columns: Mapping[str, str] | None) -> dict[str, str]:
 
 
 SLOW_S = 1.0
-"""Nobody looks for still poses in so few samples: such times are milliseconds
-of a fast logger, if nothing says so."""
+"""Interval of samples that is too long for still poses: such times are probably
+milliseconds of a fast logger."""
 
 
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
-    """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they
-    are called where that is otherwise. All other columns of finite numbers are
-    channels, by their own names, but for those that number the rows. Raises
-    InvalidData."""
+    """The samples of a table with the columns t_s, ux, uy, uz; ``columns`` gives other
+    names. All other columns of finite numbers are channels with their own names,
+    except row numbers. Raises InvalidData."""
     by_ours = called(columns)
+    # The channels with a given name, then all others.
     channels = {ours: column(table, theirs) for ours, theirs in by_ours.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
     for name in names_of(table):
         values = column(table, name)
@@ -99,27 +99,29 @@ def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_
             warnings.warn(
                 f"channel {name} left out: {gaps} of {len(values)} values missing", MissingChannel, stacklevel=4
             )
+    # The outputs, and the times from a column or from the index.
     u = np.stack([_numbers(column(table, by_ours[name]), by_ours[name]) for name in OUTPUTS], axis=1)
     name = by_ours[TIME_COLUMN]
     index = np.asarray(table.index) if name not in names_of(table) and hasattr(table, "index") else np.empty(0)
-    if name == TIME_COLUMN and index.dtype.kind in "Mm":  # of rows that are labelled by their times
+    if name == TIME_COLUMN and index.dtype.kind in "Mm":  # the times label the rows
         return samples_of(index, u, channels, time_unit, "the index")
     return samples_of(column(table, name), u, channels, time_unit, name)
 
 
 def _counts(values: Any) -> bool:
-    """Whether each value is one more than that before: as a channel it would be
-    the time again."""
+    """Whether each value is the previous one plus 1: such a channel would repeat the
+    time."""
     return len(values) > 2 and bool((np.diff(values) == 1).all())
 
 
 def samples_of(
     t: Any, u: Any, channels: Mapping[str, Any] | None = None, time_unit: str | None = None, name: str = "t"
 ) -> Samples:
-    """``t`` (n,): floats are seconds, unless ``time_unit`` names another unit,
-    datetimes are what they are, and of integers the unit is asked for, as it is
-    where seconds would be `SLOW_S` apart; ``u`` (n,3) output units;
-    ``channels`` (n,) each. Raises InvalidData."""
+    """The samples of arrays.
+
+    ``t`` (n,) has floats in seconds or in ``time_unit``, datetimes, or integers with a
+    ``time_unit``. Floats that would be `SLOW_S` apart need a unit, too. ``u`` (n,3) is
+    in output units; ``channels`` (n,) each. Raises InvalidData."""
     readings = readings_of(u)
     if readings.ndim != 2:
         raise InvalidData(f"u: expected shape (n, 3), one row a sample, not {readings.shape}")
@@ -143,8 +145,8 @@ def samples_of(
 
 
 def readings_of(u: Any) -> Floats:
-    """(3,) or (n,3) as floats; of a table by the names ux, uy, uz, where it has
-    these. Raises InvalidData."""
+    """Readings (3,) or (n,3) as floats, from an array or from the columns ux, uy, uz of
+    a table. Raises InvalidData."""
     if is_table(u) and set(OUTPUTS) <= set(names_of(u)):
         u = np.stack([np.asarray(column(u, name)) for name in OUTPUTS], axis=1)
     readings = _numbers(u, "u")
@@ -155,7 +157,7 @@ def readings_of(u: Any) -> Floats:
 
 
 def channel_of_samples(name: str, values: Any, n: int) -> Floats:
-    """(n,) of a channel that is one number or (n,). Raises InvalidData."""
+    """A channel (n,) from one number or (n,). Raises InvalidData."""
     found = _numbers(values, f"channel {name}")
     if values is None or found.shape not in ((), (n,)):
         raise InvalidData(f"channel {name}: expected one number or {n}, not shape {found.shape}")
@@ -163,8 +165,7 @@ def channel_of_samples(name: str, values: Any, n: int) -> Floats:
 
 
 def like(table: Any, columns: Mapping[str, Floats]) -> Any:
-    """A DataFrame of the same library with these columns, and the same index
-    where it has one."""
+    """A DataFrame of the table's library with these columns and the table's index."""
     kind = type(table)
     found = kind.from_pydict(dict(columns)) if hasattr(kind, "from_pydict") else kind(dict(columns))
     if hasattr(table, "index") and hasattr(found, "index"):
@@ -173,8 +174,8 @@ def like(table: Any, columns: Mapping[str, Floats]) -> Any:
 
 
 def seconds(t: Any, time_unit: str | None = None) -> Floats:
-    """(n,) s of times as `samples_of` takes them, as they are counted. Raises
-    InvalidData."""
+    """Times (n,) in seconds from those that `samples_of` accepts, without a shift.
+    Raises InvalidData."""
     return np.asarray(_time_ns(np.atleast_1d(np.asarray(t)), time_unit, "t") * 1e-9)
 
 
@@ -208,14 +209,14 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
     scaled = found * (UNITS_NS[time_unit or "s"] / UNITS_NS["s"])
     if np.abs(scaled).max(initial=0.0) > SECONDS_MOST:
         raise InvalidData(f"{name} goes to {found.max():.6g}, too much for seconds: say its unit by time_unit")
-    whole = np.floor(scaled)  # apart, so that seconds since 1970 keep their nanoseconds as far as a float has them
+    whole = np.floor(scaled)  # separate, to keep the nanoseconds of seconds since 1970 as far as a float has them
     ns = whole.astype(np.int64) * UNITS_NS["s"] + np.round((scaled - whole) * 1e9).astype(np.int64)
     return np.asarray(ns)
 
 
 def _datetimes(times: Any, name: str) -> Any:
-    """Datetimes of Python, of pandas with a zone, or as ISO text; those with a
-    zone in UTC."""
+    """datetime64[ns] from datetimes of Python, of pandas with a zone, or from ISO text.
+    Times with a zone become UTC."""
     utc = [t.replace(tzinfo=None) - t.utcoffset() if getattr(t, "tzinfo", None) else t for t in times.tolist()]
     try:
         return np.array(utc, dtype="datetime64[ns]")

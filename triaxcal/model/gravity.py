@@ -1,4 +1,4 @@
-"""Local gravity from latitude and height, and how far it may be trusted."""
+"""Local gravity from latitude and height, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ _RADIUS_M = 6_378_137.0  # semi-major axis a, GRS80
 _M = 0.00344978600308
 """Centrifugal acceleration over gravity at the equator."""
 ANOMALY_MPS2 = 1795**0.5 * 1e-5
-"""rms over the Earth of what gravity differs from this formula by: 42 mGal
+"""rms over the Earth of the difference between gravity and this formula: 42 mGal
 (Tscherning and Rapp 1974: point variance of free-air anomalies 1795 mGal²)."""
 HEIGHTS_M = (-500.0, 9000.0)
-"""From below the lowest shore on land (the Dead Sea, −430 m) to above the
-highest summit (8849 m): beyond them a height is a slip, or in other units."""
+"""From below the lowest shore on land (the Dead Sea, −430 m) to above the highest
+summit (8849 m). A height beyond them is a mistake, or in other units."""
 
 
 def local_gravity(latitude_deg: float, height_m: float) -> float:
-    """Normal gravity in m/s² at a geodetic latitude and a height above sea
-    level.
+    """Normal gravity in m/s² at a geodetic latitude and a height above sea level.
 
     Somigliana's formula on the ellipsoid, continued upwards to the second
-    degree of the height (Moritz 2000). Gravity itself differs from it by the
-    free-air anomaly, `ANOMALY_MPS2` rms. Raises InvalidData outside ±90 degrees
+    degree of the height (Moritz 2000). True gravity differs from it by the free-air
+    anomaly, `ANOMALY_MPS2` rms. Raises InvalidData outside ±90 degrees
     and −500 … 9000 m.
     """
     if not -90 <= latitude_deg <= 90:
@@ -45,6 +44,6 @@ def local_gravity(latitude_deg: float, height_m: float) -> float:
 
 
 def local_gravity_g(latitude_deg: float, height_m: float) -> tuple[float, float]:
-    """The same in units of standard gravity (9.80665 m/s²), and its standard
-    uncertainty."""
+    """`local_gravity` and its standard uncertainty, in units of standard gravity
+    (9.80665 m/s²)."""
     return local_gravity(latitude_deg, height_m) / STANDARD_GRAVITY, ANOMALY_MPS2 / STANDARD_GRAVITY

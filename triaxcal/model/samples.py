@@ -1,4 +1,5 @@
-"""Which moment of its recording a calibration holds for."""
+"""The raw stream of a triad, and the moment of a recording for which a calibration
+holds."""
 
 from __future__ import annotations
 
@@ -13,20 +14,17 @@ from triaxcal.errors import InvalidData
 
 
 class Moment(StrEnum):
-    """By name; `SECONDS` where it is a number."""
+    """A moment of a recording by name; `SECONDS` for a number."""
 
     END = "end"
     MEAN = "mean"
     SECONDS = "seconds"
 
 
-# The raw stream of one triad.
-
-
 @dataclass(frozen=True)
 class Samples:
-    """``time_ns`` (n,) strictly increasing; ``readings`` (n,3) output units;
-    ``channels`` name → (n,)."""
+    """The raw stream of one triad: ``time_ns`` (n,) strictly increasing; ``readings``
+    (n,3) in output units; ``channels`` name → (n,). Raises InvalidData."""
 
     time_ns: Ints
     readings: Floats

@@ -19,19 +19,18 @@ from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 
 LINEAR = 9
-"""Parameters without effects: scale factor, misalignment and bias, three of
-each."""
+"""Number of linear parameters: scale factor, misalignment and bias, three of each."""
 
 SOLVE_TOLERANCE = 1e-13
-"""Relative step, of the reference vector, at which the inverse of a nonlinear
-model counts as found."""
+"""Relative step, of the reference vector, at which the inverse of a nonlinear model
+has converged."""
 
 
 class Radius(NamedTuple):
-    """|a| (n,) and what it follows from: ``s`` = R a and ``a`` (n,3) in g.
+    """The magnitude |a| (n,), with ``s`` = R a and ``a`` (n,3) in g.
 
-    ``by_s`` (n,3) is its gradient by s, ``by_v`` (n,3) by the reading in g less
-    the bias, v = K⁻¹ u − b.
+    ``by_s`` (n,3) is its gradient by s, ``by_v`` (n,3) that by the reading in g
+    without the bias, v = K⁻¹ u − b.
     """
 
     length: Floats
@@ -47,8 +46,8 @@ class Radius(NamedTuple):
         return -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
 
     def by_coefficients(self, effect: Effect, covariates: Mapping[str, Floats]) -> Floats:
-        """(n,p) derivatives by the coefficients of an effect, whether the
-        sensor has it or not."""
+        """(n,p) derivatives by the coefficients of an effect, also of one that the
+        sensor lacks."""
         return np.asarray(-np.einsum("ni,nip->np", self.by_v, effect.basis(self.s, covariates)))
 
 
@@ -74,8 +73,8 @@ class Sensor:
 
     @property
     def matrix(self) -> Floats:
-        """A = (K R)⁻¹ (3,3), upper triangular: ``a = A (u − c)`` where there
-        are no effects (eq. 4)."""
+        """A = (K R)⁻¹ (3,3), upper triangular: ``a = A (u − c)`` without effects
+        (eq. 4)."""
         return np.linalg.inv(self.scale_factor[:, None] * self.axes)
 
     @property
@@ -84,8 +83,8 @@ class Sensor:
         return self.scale_factor * self.bias
 
     def moved(self, by: Floats) -> Sensor:
-        """With ``by`` (9+p,) added to scale factors, misalignments, biases and
-        the effects' coefficients."""
+        """The sensor with ``by`` (9+p,) added to scale factors, misalignments, biases
+        and the effects' coefficients."""
         at, effects = 9, []
         for effect, q in self.effects:
             effects.append((effect, q + by[at : at + len(q)]))
@@ -113,20 +112,20 @@ class Sensor:
         return slope
 
     def along_axes(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        """s = R a (n,3): the inverse up to the axes, by Newton's method where
-        there are effects.
+        """s = R a (n,3): the inverse except for the axes, with effects by Newton's
+        method.
 
-        Raises Refused where the model has no inverse at a reading, as the
-        methods that follow from this do.
+        Raises Refused if the model has no inverse at a reading. The methods that call
+        this one raise it, too.
         """
         v = u / self.scale_factor - self.bias
         if not self.effects:
             return v
         s = v.copy()
-        with np.errstate(over="ignore", invalid="ignore"):  # beyond what the model holds for it may go anywhere
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the model it may diverge
             for _ in range(50):
-                miss = s + self.departure(s, covariates) - v
-                step = _solved(self.departure_slope(s, covariates), miss)
+                residual = s + self.departure(s, covariates) - v
+                step = _solved(self.departure_slope(s, covariates), residual)
                 s -= step
                 if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
                     break
@@ -170,25 +169,25 @@ class Sensor:
     def radius_by_parameters(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """(n,9+p) derivatives of |a| by scale factors, misalignments, biases
         and coefficients."""
-        found = self.radius(u, covariates)
-        effects = [found.by_coefficients(effect, covariates) for effect, _ in self.effects]
-        by_scale_factor = -found.by_v * u / self.scale_factor**2
-        return np.concatenate([by_scale_factor, found.by_misalignment, -found.by_v, *effects], axis=1)
+        radius = self.radius(u, covariates)
+        effects = [radius.by_coefficients(effect, covariates) for effect, _ in self.effects]
+        by_scale_factor = -radius.by_v * u / self.scale_factor**2
+        return np.concatenate([by_scale_factor, radius.by_misalignment, -radius.by_v, *effects], axis=1)
 
     def magnitude(self, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats]:
         """|a| (n,) and its gradient by the outputs (n,3)."""
-        found = self.radius(u, covariates)
-        return found.length, found.by_v / self.scale_factor
+        radius = self.radius(u, covariates)
+        return radius.length, radius.by_v / self.scale_factor
 
 
 _UNITY = np.eye(3)
-"""The derivative of a reading that has no effects in it: the unit matrix, made
-once."""
+"""The derivative of a reading without effects."""
 
 
 def _solved(slopes: Floats, right: Floats) -> Floats:
-    """(n,3) by unity and the slopes (n,3,3) of a departure."""
-    if not slopes.any():  # what acts on the bias alone
+    """(n,3) solutions x of (1 + slopes) x = right, with the slopes (n,3,3) of a
+    departure."""
+    if not slopes.any():  # effects on the bias alone
         return right
     try:
         return np.asarray(np.linalg.solve(_UNITY + slopes, right[..., None])[..., 0])

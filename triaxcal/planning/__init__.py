@@ -1,12 +1,12 @@
 """Where to point the unit: directions, their order, designs for suspected
 effects, and what a set still lacks."""
 
-from triaxcal.model.bias_directions import bias_directions
 from triaxcal.model.directions import (
     FULL,
     LEAST,
     PAPER,
     Direction,
+    bias_directions,
     closed,
     cube_directions,
     dilution,
@@ -20,14 +20,15 @@ from triaxcal.model.directions import (
 from triaxcal.planning.addition import Addition, MissingPoses, missing_poses
 from triaxcal.planning.design import (
     Observability,
+    OptimalPlan,
     TargetEffects,
     in_plan,
     needs_time,
     observability,
+    optimal,
     target_effects,
     unseen_effects,
 )
-from triaxcal.planning.optimal_plan import OptimalPlan, optimal
 
 __all__ = [
     "FULL",

@@ -34,10 +34,10 @@ from triaxcal.planning.design import (
     TargetEffects,
     channels_needed,
     combinations,
+    profile,
     profile_times,
     target_effects,
 )
-from triaxcal.planning.optimal_plan import profile
 from triaxcal.poses.covariates import channels_of
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, within_pose_dof
 from triaxcal.poses.pose import Pose
@@ -102,7 +102,7 @@ def fit_with_estimable(
 def _shaped(problem: Problem, state: State, effect: Effect) -> Effect:
     if not isinstance(effect, OnPlansClock):
         return effect
-    variants = effect.whole.variants(problem.covariates)
+    variants = effect.inner.variants(problem.covariates)
     return min(variants, key=lambda e: residual_chi2(linearise(problem, state.extended([e]))))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
@@ -284,3 +284,17 @@ def _vibration_parts(w: Windows, s: Span) -> tuple[VibrationPart, ...]:
         scatter, times = np.sqrt(variance[axis]), np.sqrt(variance[axis] / usual[axis])
         parts.append(VibrationPart(start_s, end_s, float(scatter), float(times)))
     return tuple(parts)
+
+
+# Names of poses in sentences: the time at which they began.
+
+
+def moment(began: PoseStart) -> str:
+    """When a pose began, and in which of several recordings, counted from 1."""
+    of = "" if began.recording is None else f" of recording {began.recording + 1}"
+    return f"{began.start_s:.1f} s{of}"
+
+
+def the_poses(began: Iterable[PoseStart]) -> str:
+    """The poses, by the times at which they began."""
+    return " and ".join(f"the pose at {moment(b)}" for b in began)

@@ -6,7 +6,6 @@ checked or read.
 """
 
 from triaxcal.schema.calibration import Calibration
-from triaxcal.schema.figures import Residual, Uncertainty
 from triaxcal.schema.loop import (
     AnotherUnit,
     Candidate,
@@ -19,7 +18,7 @@ from triaxcal.schema.loop import (
     Trace,
     Unexplained,
 )
-from triaxcal.schema.model import Figure, Model, Sha256, Text, Word
+from triaxcal.schema.model import Figure, Model, Residual, Sha256, Text, Uncertainty, Word
 from triaxcal.schema.poses import Poses
 
 __all__ = [

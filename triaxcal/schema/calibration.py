@@ -10,8 +10,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from triaxcal.schema.figures import ByParameter, Residual, Uncertainty
-from triaxcal.schema.model import Figure, Figures, Matrix, Model, Sha256, Text, Vector
+from triaxcal.schema.model import (
+    ByParameter,
+    Figure,
+    Figures,
+    Matrix,
+    Model,
+    Residual,
+    Sha256,
+    Text,
+    Uncertainty,
+    Vector,
+)
 
 Excluded = Literal["fault", "outlier", "caller", "unknown_history"]
 Source = Literal["poses", "passport", "both"]

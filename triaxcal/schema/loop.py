@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from triaxcal.schema.calibration import Calibration, Coefficient, UnitOfCalibration
-from triaxcal.schema.figures import Residual
-from triaxcal.schema.model import Figure, Figures, Model, Text
+from triaxcal.schema.model import Figure, Figures, Model, Residual, Text
 
 Nothing = Annotated[None, Field(description="of 0.1: `null`")]
 """A key that has no meaning since names have probabilities."""

@@ -9,10 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from triaxcal.text.budget import basis, not_evaluated, remedy
+from triaxcal.text.calibration import as_at, holds, html, poses, short, summary, use, verification
 from triaxcal.text.cautions import caution
-from triaxcal.text.holds import as_at, holds, use
 from triaxcal.text.quality import quality, quality_line
-from triaxcal.text.summary import html, poses, short, summary, verification
 
 if TYPE_CHECKING:
     from triaxcal.text import advice, bias_update, diagnosis, pooled_units, traces

@@ -6,17 +6,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from triaxcal.diagnosis import Loop, Recommendation, Verdict
-from triaxcal.effects.plugins import package_of
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.effects.catalogue import package_of
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.next_measurement import Action, ActionKind
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.number_format import plain
 from triaxcal.planning.addition import ChannelRange
-from triaxcal.poses.pose import Pose
-from triaxcal.poses.pose_in_words import moment, the_poses
+from triaxcal.poses.pose import Pose, moment, the_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import Scopes
+from triaxcal.uncertainty.combined import Scopes
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999

@@ -9,10 +9,9 @@ import numpy as np
 
 from triaxcal.estimate import calibration as of_fit
 from triaxcal.frames import faces, orientations, standing, unit_frames
-from triaxcal.inputs import attitude, bias_update, datasheet
-from triaxcal.inputs.turning import rotation
+from triaxcal.inputs import attitude, bias_update, datasheet, rotation
 from triaxcal.number_format import micro_g, number_of, plain
-from triaxcal.poses.pose_in_words import moment, the_poses
+from triaxcal.poses.pose import moment, the_poses
 from triaxcal.uncertainty.propagation import Extrapolated
 
 RAISED = "the standard errors are raised by that"

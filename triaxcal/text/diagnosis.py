@@ -11,14 +11,13 @@ from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import Residual
 from triaxcal.estimate.hold_out import Contradiction, HoldOut
-from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.posterior import Findings, Unexplained
 from triaxcal.number_format import number_of, plain
-from triaxcal.poses.pose import PoseStart
-from triaxcal.poses.pose_in_words import moment
+from triaxcal.poses.pose import PoseStart, moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, notes, to_do
 from triaxcal.uncertainty import Stated, budget
-from triaxcal.uncertainty.another_day import NextRecording, Scopes, Source
+from triaxcal.uncertainty.combined import NextRecording, Scopes, Source
 from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "notes", "reason", "unexplained"]

@@ -8,11 +8,9 @@ reference conditions. That last figure, its rms over the sphere, is what the
 sources are weighed by.
 """
 
-from triaxcal.uncertainty.another_day import next_recording
-from triaxcal.uncertainty.combined import Budget, Combined, budget
-from triaxcal.uncertainty.components import Component
+from triaxcal.uncertainty.combined import Budget, Combined, budget, next_recording
+from triaxcal.uncertainty.components import SENSITIVITY_PER_K, Component
 from triaxcal.uncertainty.statements import Stated
-from triaxcal.uncertainty.thermal import SENSITIVITY_PER_K
 
 __all__ = [
     "SENSITIVITY_PER_K",

@@ -13,11 +13,10 @@ from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
+from triaxcald.provision.access import Label
 from triaxcald.provision.identity import serial_text
-from triaxcald.provision.power import MISSED
 from triaxcald.provision.registers import RegisterImage, calibration_registers, sanity_warnings
-from triaxcald.provision.restart_check import SEQUENCES, may_probe, own_steps, writes_of
-from triaxcald.provision.sequence import Label
+from triaxcald.provision.restart_check import MISSED, SEQUENCES, may_probe, own_steps, writes_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE

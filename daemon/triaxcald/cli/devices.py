@@ -13,10 +13,9 @@ from triaxcald import text
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.explain import explain
 from triaxcald.provision.identity import identified
 from triaxcald.provision.journal import open_journal
-from triaxcald.provision.registers import take_snapshot
+from triaxcald.provision.registers import explain, take_snapshot
 from triaxcald.station.config import Place, Station, load_station
 
 # What a command that writes nothing owes to whoever reads a device in between.

@@ -18,8 +18,8 @@ from triaxcald.cli.syntax import writable
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside
 from triaxcald.inputs import CALIBRATION, Measured, read_document
-from triaxcald.recording.export import write_csv
 from triaxcald.tables.arrow import write_parquet
+from triaxcald.tables.native_csv import write_csv
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 

@@ -300,7 +300,7 @@ def _of_buses(
 
 def _segments(a: argparse.Namespace) -> Segments | None:
     """Segments by the options; None without any of these."""
-    from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
+    from triaxcald.recording.manifest import SEGMENT_BYTES, SEGMENT_S, Retention
     from triaxcald.run.session import Segments
 
     if all(given is None for given in (a.segment_size, a.segment_time, a.keep, a.keep_free)):

@@ -19,14 +19,13 @@ from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file, require_new, require_recording
-from triaxcald.imports import notices
-from triaxcald.imports.of_recording import is_own, own_log
+from triaxcald.imports.importing import left_out, remarks, summary
+from triaxcald.imports.of_can import is_own, own_log
 from triaxcald.inputs import bundle_of, losses_of, samples_of
-from triaxcald.recording.contents import Contents
-from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
+from triaxcald.recording.reader import Contents, open_recording
 from triaxcald.recording.recover import recover
-from triaxcald.recording.series import open_recording
+from triaxcald.tables.native_csv import Rows, write_csv
 
 
 def audit_command(a: argparse.Namespace) -> int:
@@ -170,11 +169,11 @@ def import_command(a: argparse.Namespace) -> int:
             from triaxcald.imports.of_mcap import import_mcap
 
             made = import_mcap(log, bundle, a.output, channel=a.channel)
-    for line in (notices.left_out(made.document), *notices.remarks(made.document, made.seconds)):
+    for line in (left_out(made.document), *remarks(made.document, made.seconds)):
         if line:
             say(line)
     if a.json:
         emit({"format": "triaxcal.import/1", "output": str(a.output), "duration_s": made.seconds, **made.document})
     else:
-        show(notices.summary(a.output, made.document, made.seconds))
+        show(summary(a.output, made.document, made.seconds))
     return 0

@@ -12,7 +12,7 @@ import triaxcal as tc
 from triaxcald.cli.console import at, say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, require_same_outputs
-from triaxcald.recording.series import is_recording
+from triaxcald.recording.reader import is_recording
 from triaxcald.tables.samples import Reading
 
 

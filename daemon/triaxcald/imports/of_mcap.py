@@ -11,8 +11,7 @@ from typing import Any, cast
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.errors import InputError
-from triaxcald.imports import notices
-from triaxcald.imports.importing import Imported, Importing, Record, Times, write_recording
+from triaxcald.imports.importing import Imported, Importing, Record, Times, no_samples, write_recording
 
 # Whose messages those of a topic are, where several publish on it: an MCAP file has
 # a channel for each.
@@ -218,7 +217,7 @@ class _Work:
         follow = self._channels.settle(self._log.name)
         counts = importing.counts
         if not counts["samples"]:
-            why = ", ".join(notices.no_samples(counts)) or "none is of the readings"
+            why = ", ".join(no_samples(counts)) or "none is of the readings"
             raise InputError(
                 f"{self._log.name}: no sample in its {tc.number_format.number_of(self._taken, 'message')} of "
                 f"the profile: {why}"

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import triaxcal_drivers as td
 from triaxcald.errors import ProvisionError, TwoAnswer
-from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.sequence import contact_register
+from triaxcald.provision.access import RegisterLink, contact_register
 
 
 class WrongUnit(ProvisionError):

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import triaxcal_drivers as td
 from triaxcald.errors import DiskError, InputError, ProvisionError, StationError, TwoAnswer
-from triaxcald.provision.access import NO_CONTACT, RegisterLink
+from triaxcald.provision.access import NO_CONTACT, Label, RegisterLink, lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity, identified, require_alone
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of, was_cut_short
 from triaxcald.provision.registers import (
@@ -25,7 +25,6 @@ from triaxcald.provision.registers import (
     unstable,
 )
 from triaxcald.provision.restart_check import Restart, checked_restart
-from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.software import new_run_id
 

@@ -1,17 +1,24 @@
-"""Restarts a device and checks that it restarted."""
+"""Restarts a device and checks that it restarted; detects a power cycle."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
 import triaxcal_drivers as td
 from triaxcald.errors import ProvisionError, StationError, TwoAnswer
-from triaxcald.provision.access import NO_CONTACT, RegisterLink
+from triaxcald.provision.access import (
+    NO_CONTACT,
+    Label,
+    RegisterLink,
+    contact_register,
+    lock_quietly,
+    reconnect,
+    run_sequence,
+)
 from triaxcald.provision.identity import WrongUnit, check_identity
-from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 
 ATTEMPTS = 2
 """A restart command may get lost, and the link does not repeat it. The second
@@ -236,3 +243,45 @@ async def _read_again(link: RegisterLink, profile: td.Profile, name: str) -> byt
         link.refresh()
         await reconnect(link, profile)
         return await link.read(name)
+
+
+# Detects a power cycle of a device.
+
+LOOK_S = 0.2
+"""Period of the requests; a person switches a supply off for longer."""
+MISSED = 3
+"""Unanswered requests in a row that count as no supply: by chance once in a million
+on a link that loses one in a hundred."""
+
+
+def least_off_s(profile: td.Profile) -> float:
+    """Shortest time without supply that is detected [s]."""
+    return MISSED * (profile.sampling.reply_timeout_s + LOOK_S)
+
+
+async def power_cycled(
+    link: RegisterLink, profile: td.Profile, patience_s: float, off: Callable[[], None] = lambda: None
+) -> bool:
+    """Whether the device, within ``patience_s``, answers, goes silent and answers
+    again. A busy or refusing device has its supply. ``off`` is called once the device
+    is silent.
+    """
+    register = contact_register(profile) or next(iter(profile.registers))
+    deadline_s, missed, answered = link.clock.now_s() + patience_s, 0, False
+    while missed < MISSED:
+        if link.clock.now_s() >= deadline_s:
+            return False
+        try:
+            await link.read_once(register)
+            missed, answered = 0, True
+        except td.RegisterRefused:
+            missed, answered = 0, True
+        except NO_CONTACT:
+            missed += answered
+            await link.renew()
+        await link.clock.sleep(LOOK_S)
+    off()
+    with suppress(td.DriverError):
+        await reconnect(link, profile, max(deadline_s - link.clock.now_s(), LOOK_S))
+        return True
+    return False

@@ -9,10 +9,8 @@ from typing import Any
 
 from triaxcald.recording import schema
 from triaxcald.recording.bus import describe_bus, is_of_bus
-from triaxcald.recording.contents import Contents
-from triaxcald.recording.file import ENDED
-from triaxcald.recording.reader import Recording
-from triaxcald.recording.series import Series, open_recording
+from triaxcald.recording.reader import Contents, Recording, Series, open_recording
+from triaxcald.recording.writer import ENDED
 
 
 def describe(path: Path) -> dict[str, Any]:

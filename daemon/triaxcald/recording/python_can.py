@@ -37,8 +37,7 @@ class RecordingMessageWriter(SizedMessageWriter):
     def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
         import can
 
-        from triaxcald.recording.bus import bus_record
-        from triaxcald.recording.can_messages import FIELDS, batches_of, row_of
+        from triaxcald.recording.bus import FIELDS, batches_of, bus_record, row_of
         from triaxcald.recording.schema import BUS_RECORD
         from triaxcald.recording.writer import RecordingWriter
 
@@ -109,7 +108,7 @@ class RecordingMessageReader(MessageReader):
             self._recording = Recording(file, str(getattr(file, "name", "recording")))
 
     def __iter__(self) -> Iterator[Message]:
-        from triaxcald.recording.can_messages import messages_of
+        from triaxcald.recording.bus import messages_of
 
         return messages_of(self._recording)
 

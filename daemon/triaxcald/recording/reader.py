@@ -1,13 +1,20 @@
-"""Reads a recording in bounded memory, one chunk at a time, and rejects data that
-fails its CRC."""
+"""Reads a recording, be it one file or segments read as one, in bounded memory: one
+chunk at a time. Data that fails its CRC is rejected."""
 
 from __future__ import annotations
 
+import hashlib
+import sys
+import tomllib
 import zlib
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from types import TracebackType
+from typing import BinaryIO, NamedTuple, Self, TypeVar
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
@@ -15,8 +22,7 @@ from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata
 import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
-from triaxcald.recording.contents import Contents, TopicMessage
-from triaxcald.recording.manifest import is_manifest, load_manifest
+from triaxcald.recording.manifest import Manifest, Segment, is_manifest, load_manifest
 from triaxcald.recording.mcap_records import (
     HEAD,
     MAGIC,
@@ -34,6 +40,157 @@ from triaxcald.recording.mcap_records import (
     walk,
     written_to,
 )
+from triaxcald.recording.schema import Fields, batch_of, decode_raw, fields_of
+
+# The contents of a recording, be it one file or segments.
+
+T = TypeVar("T")
+JOINED = 1 << 15
+"""Raw records that are decoded at once: so many that the cost of a call no
+longer counts, and less than a MiB."""
+JOINED_BYTES = 8 * 2**20
+"""So much is held at most, whatever the messages say of their records: those of
+64 bytes, twice over."""
+
+
+class TopicMessage(NamedTuple):
+    topic: str
+    message: Message
+
+
+class Contents(ABC):
+    """A context manager. ``metadata`` by record, ``attachments`` by name.
+
+    Every iterator raises RecordingError.
+    """
+
+    name: str
+    metadata: dict[str, dict[str, str]]
+    attachments: Mapping[str, bytes]
+
+    @abstractmethod
+    def is_confirmed(self, first: int) -> bool:
+        """Whether the raw records of the message that begins with this running
+        index are the unit's for all that is known."""
+
+    @property
+    @abstractmethod
+    def any_unconfirmed(self) -> bool: ...
+
+    def unconfirmed_records(self) -> int:
+        """How many raw records are unconfirmed."""
+        if not self.any_unconfirmed:
+            return 0
+        return sum(len(batch) for _, batch in self.joined_batches() if batch.unconfirmed)
+
+    @abstractmethod
+    def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
+        """Every message with its topic, undecoded, in the order of the file;
+        those of one ``topic`` where it is given."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def phases(self) -> list[str]:
+        """In the order in which they began."""
+        return list(dict.fromkeys(phase for phase, _ in self.joined_batches()))
+
+    def raw(self, phase: str) -> Iterator[td.RawBatch]:
+        """The phase's raw records in the order in which they came, some
+        `JOINED` at a time: a live bus hands out few. Without those that are
+        unconfirmed: nothing is computed from them."""
+        return (batch for _, batch in self._raw(phase.encode()) if not batch.unconfirmed)
+
+    def joined_batches(self) -> Iterator[tuple[str, td.RawBatch]]:
+        """All raw records with their phase, likewise, but also those that are
+        unconfirmed; the batch says so."""
+        return self._raw()
+
+    def raw_batches(self) -> Iterator[tuple[str, td.RawBatch]]:
+        """The same in the batches in which they were recorded, of which the
+        phases take turns."""
+        for first, phase, batch in self._decoded(schema.RAW, decode_raw):
+            yield phase, batch if self.is_confirmed(first) else replace(batch, unconfirmed=True)
+
+    def _raw(self, phase: bytes | None = None) -> Iterator[tuple[str, td.RawBatch]]:
+        waiting, records, size = list[tuple[int, Fields]](), 0, 0
+        for message, fields in self._read(schema.RAW, fields_of):
+            if phase is not None and fields.phase != phase:
+                continue
+            if waiting and not self._belong_together(waiting[0][1], fields):
+                yield self._joined(waiting)
+                waiting, records, size = [], 0, 0
+            waiting.append((message.log_time, fields))
+            records, size = records + len(fields.flags), size + len(message.data)
+            if records >= JOINED or size >= JOINED_BYTES:
+                yield self._joined(waiting)
+                waiting, records, size = [], 0, 0
+        if waiting:
+            yield self._joined(waiting)
+
+    def _belong_together(self, one: Fields, other: Fields) -> bool:
+        return one.phase == other.phase and self.is_confirmed(one.first) == self.is_confirmed(other.first)
+
+    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> tuple[str, td.RawBatch]:
+        """Of messages of one phase that are all confirmed, or none of them.
+        Raises RecordingError, which names the message at fault."""
+        time_ns, first = waiting[0]
+        phase = self._decode(schema.RAW, time_ns, first.phase.decode)
+        try:
+            batch = batch_of([fields for _, fields in waiting])
+            return phase, batch if self.is_confirmed(first.first) else replace(batch, unconfirmed=True)
+        except ValueError:
+            for time_ns, fields in waiting:
+                self._decode(schema.RAW, time_ns, partial(batch_of, [fields]))
+            raise
+
+    @property
+    def ends_with(self) -> str:
+        """The format of the document that the whole recording ends with; empty
+        where it ends with none."""
+        return self.metadata[schema.FORMAT_RECORD].get(schema.ENDS_WITH, "")
+
+    def raw_digest(self) -> schema.RawDigest:
+        """Of all raw records; the metadata record ``raw`` says what it was when
+        they were written."""
+        digest = schema.RawDigest(self.ends_with)
+        for phase, batch in self.joined_batches():
+            digest.update(phase, batch)
+        return digest
+
+    def register_accesses(self) -> Iterator[schema.RegisterAccess]:
+        return self._decoded(schema.REGISTERS, schema.decode_register_access)
+
+    def events(self) -> Iterator[schema.Event]:
+        return self._decoded(schema.EVENTS, schema.decode_event)
+
+    def losses(self) -> Iterator[schema.Loss]:
+        return self._decoded(schema.LOSS, schema.decode_loss)
+
+    def _decoded(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[T]:
+        return (value for _, value in self._read(topic, decode))
+
+    def _read(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[tuple[Message, T]]:
+        for _, message in self.messages(topic):
+            yield message, self._decode(topic, message.log_time, partial(decode, message.data))
+
+    def _decode(self, topic: str, time_ns: int, decode: Callable[[], T]) -> T:
+        """Raises RecordingError."""
+        try:
+            return decode()
+        except ValueError as e:
+            raise RecordingError(f"{self.name}: {topic} at {time_ns} ns: {e}") from e
+
+
+# A recording in one file.
 
 METADATA_MOST = 2**20  # bytes; ours has some hundred
 ATTACHMENTS_MOST = 1000  # a run leaves a dozen
@@ -251,3 +408,127 @@ class Recording(Contents):
         if tail != MAGIC:
             kind = CutShort if MAGIC.startswith(tail) else Damage
             raise kind(self.name, unparsed.end, "the file does not end as it should")
+
+
+# A recording in segments, read as one.
+
+_BLOCK = 2**20
+_MEANT_BY = {"unit": ("name", "serial", "signs"), schema.BUS_RECORD: ("name", "channel")}
+"""What of the metadata says whose records they are, and how they are read."""
+
+
+class Series(Contents):
+    """All segments that are there, one open at a time. Metadata and attachments
+    are those of the first.
+
+    Each segment is compared with the manifest when it is read, and with the
+    first unless they need not be ``alike``: records mean the same in all of
+    them. Raises RecordingError: one is missing, or is not as it was.
+    """
+
+    def __init__(self, path: Path, *, alike: bool = True) -> None:
+        self.name = str(path)
+        self._alike = alike
+        self.manifest: Manifest = load_manifest(path)
+        if not self.manifest.segments:
+            raise RecordingError(f"{path}: no segment is left of this recording")
+        for segment in self.manifest.segments:
+            self._require_there(segment)
+        self._unconfirmed = [
+            range(s.unconfirmed, s.end if s.state != "open" else sys.maxsize)
+            for s in self.manifest.segments
+            if s.unconfirmed is not None
+        ]
+        self._first = self._opened(self.manifest.segments[0])
+        own = (schema.SEGMENT_RECORD, schema.RAW_RECORD)
+        self.metadata = {name: record for name, record in self._first.metadata.items() if name not in own}
+        self.attachments: Attachments = self._first.attachments
+
+    def close(self) -> None:
+        self._first.close()
+
+    @property
+    def size(self) -> int:
+        return sum(segment.bytes for segment in self.manifest.segments)
+
+    @property
+    def any_unconfirmed(self) -> bool:
+        return bool(self._unconfirmed)
+
+    def is_confirmed(self, first: int) -> bool:
+        return not any(first in indices for indices in self._unconfirmed)
+
+    def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
+        yield from self._first.messages(topic)
+        for segment in self.manifest.segments[1:]:
+            with self._opened(segment) as recording:
+                if self._alike:
+                    self._require_alike(recording, segment)
+                yield from recording.messages(topic)
+
+    def _require_there(self, segment: Segment) -> None:
+        path = self.manifest.path_of(segment)
+        try:
+            size = path.stat().st_size
+        except OSError as e:
+            raise RecordingError(f"{self.name}: segment {segment.file}: {e.strerror}") from e
+        if segment.state != "open" and size != segment.bytes:
+            raise RecordingError(
+                f"{self.name}: segment {segment.file}: {size} bytes, expected {segment.bytes}; it was changed since"
+            )
+
+    def _require_alike(self, recording: Recording, segment: Segment) -> None:
+        """What is in a segment means what it does in the first: the station
+        file may have changed in between, and with it profile, signs or bus. One
+        that ended before its first record may lack attachments."""
+        first, ours, theirs = self.manifest.segments[0].file, self.metadata, recording.metadata
+        named = [
+            f"{key} of the {record}"
+            for record, keys in _MEANT_BY.items()
+            for key in keys
+            if theirs.get(record, {}).get(key) != ours.get(record, {}).get(key)
+        ]
+        there = set(self.attachments) & set(recording.attachments) - {schema.STATION_FILE}
+        named += [name for name in sorted(there) if not _alike(recording.attachments[name], self.attachments[name])]
+        if named:
+            raise RecordingError(
+                f"{self.name}: segment {segment.file}: {', '.join(named)}: not as in {first}; "
+                "read the segments before and after such a change one by one"
+            )
+
+    def _opened(self, segment: Segment) -> Recording:
+        path = self.manifest.path_of(segment)
+        if segment.state != "open" and digest_of(path) != segment.sha256:
+            raise RecordingError(f"{self.name}: segment {segment.file}: was changed since it was recorded")
+        return Recording.open(path, unfinished=segment.state != "closed")
+
+
+def _alike(one: bytes, other: bytes) -> bool:
+    """Of two files of a profile: comments and blanks of TOML mean nothing."""
+    try:
+        return one == other or tomllib.loads(one.decode()) == tomllib.loads(other.decode())
+    except (ValueError, RecursionError):
+        return False
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of the whole file. Raises RecordingError."""
+    try:
+        digest = hashlib.sha256()
+        with td.files.open_file(path) as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+        return digest.hexdigest()
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
+
+
+def open_recording(path: Path, *, unfinished: bool = False, alike: bool = True) -> Recording | Series:
+    """One file, or all that a manifest names, as `Recording` and `Series` have
+    them. Raises RecordingError."""
+    return Series(path, alike=alike) if is_manifest(path) else Recording.open(path, unfinished=unfinished)
+
+
+def is_recording(name: str) -> bool:
+    """Whether a file of that name is a recording of ours, and not a table."""
+    return name.endswith(".mcap") or is_manifest(name)

@@ -1,7 +1,7 @@
-"""Makes the manifest of a recording in segments anew from the files beside it.
+"""Rebuilds the manifest of a recording in segments from the files beside it.
 
-A manifest that cannot be used keeps nobody from recording. It is renamed, never
-removed, and a new one lists the segments that are there.
+A manifest that cannot be used prevents no recording. It is renamed, never deleted,
+and a new one lists the segments on the disk.
 """
 
 from __future__ import annotations
@@ -40,23 +40,22 @@ from triaxcald.recording.mcap_records import (
     unparsed_at,
     written_to,
 )
-from triaxcald.recording.raw_batch import decode_raw
-from triaxcald.recording.reader import Recording
-from triaxcald.recording.series import digest_of
+from triaxcald.recording.reader import Recording, digest_of
+from triaxcald.recording.schema import decode_raw
 
 _KEPT = ".replaced"
 _FOOTER_BYTES = 20  # of the body of a footer record
 _DIGITS = re.compile(r"[0-9]{1,18}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
-Told = Mapping[str, str]
-"""What a segment's metadata say of its place: number, first, and the one before
-with its digest."""
+Place = Mapping[str, str]
+"""A segment's metadata about its place: its number, the running index of its first
+record, and the name and digest of the previous segment."""
 
 
 class Opened(NamedTuple):
-    """A manifest to record behind. ``warning`` says what was wrong with the
-    file that was there, ``kept`` is the name it has now."""
+    """A manifest that a recording can continue. ``warning`` tells the fault of the
+    manifest on the disk, ``kept`` is the new name of that file."""
 
     manifest: Manifest
     warning: str | None = None
@@ -64,13 +63,14 @@ class Opened(NamedTuple):
 
 
 def open_manifest(path: Path) -> Opened:
-    """The manifest at ``path``; one rebuilt from the segments where there is
-    none, where it cannot be used, or where it does not list the files that are
-    there. Writes nothing but the new name of a manifest that was replaced.
-    Raises OSError."""
+    """The manifest at ``path``. It is rebuilt from the segments if it is missing,
+    cannot be used, or does not list the files on the disk. The only change on the
+    disk is the new name of a replaced manifest. Raises OSError."""
+    # No manifest: rebuild it without reading whole segments.
     if not os.path.lexists(path):
         rebuilt = _from_files(path, reading=False)
-        return Opened(rebuilt, f"{path}: was missing; {_by(rebuilt)}" if rebuilt.segments else None)
+        return Opened(rebuilt, f"{path}: was missing; {_rebuilt_from(rebuilt)}" if rebuilt.segments else None)
+    # A manifest that can be read is compared with the files, another one is rebuilt.
     try:
         found = parsed_manifest(path)
     except RecordingError as e:
@@ -80,34 +80,38 @@ def open_manifest(path: Path) -> Opened:
         if not wrong:
             return Opened(found)
         wrong = f"{path}: {wrong}"
-    aside = unused(path.with_name(path.name + _KEPT))
-    path.rename(aside)
-    return Opened(rebuilt, f"{wrong}; it is kept as {aside.name}; {_by(rebuilt)}", aside.name)
+    # Keep the old manifest under a new name.
+    renamed = unused(path.with_name(path.name + _KEPT))
+    path.rename(renamed)
+    return Opened(rebuilt, f"{wrong}; it is kept as {renamed.name}; {_rebuilt_from(rebuilt)}", renamed.name)
 
 
-def _by(rebuilt: Manifest) -> str:
+def _rebuilt_from(rebuilt: Manifest) -> str:
     return f"the manifest was rebuilt from {tc.number_format.number_of(len(rebuilt.segments), 'segment')}"
 
 
-def settled(manifest: Manifest) -> Manifest:
-    """Its last segment as it lies on the disk, where it was not closed: what
-    became of it is no reason not to record. Raises OSError."""
+def with_last_on_disk(manifest: Manifest) -> Manifest:
+    """The manifest with its last segment as it is on the disk, if that segment was not
+    closed. Its state never prevents a recording. Raises OSError."""
     if not manifest.segments or manifest.segments[-1].state != "open":
         return manifest
     last = manifest.segments[-1]
     path = manifest.path_of(last)
+    # A segment without any record is dropped.
     if not os.path.lexists(path) or _nothing_reached(path):
         with suppress(FileNotFoundError):
             path.unlink()
         return replace(manifest, segments=manifest.segments[:-1])
     found = _with_digest(path, _on_disk(path, last))
-    # Killed after the file said so, and before the manifest did.
+    # The process may have been killed after the file recorded unconfirmed records and
+    # before the manifest did.
     return replace(manifest, segments=_with_unconfirmed(manifest.with_last(found).segments))
 
 
 def _with_unconfirmed(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
-    """A file says from which running index on records are unconfirmed, up to
-    its own end; the index may lie in an earlier segment."""
+    """Marks unconfirmed records in earlier segments. A file records the running index
+    from which on records are unconfirmed up to its end; that index may lie in an
+    earlier segment."""
     found = list(segments)
     for at, segment in enumerate(segments):
         if (first := segment.unconfirmed) is None:
@@ -119,13 +123,13 @@ def _with_unconfirmed(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
     return tuple(found)
 
 
-# Which files belong to it
+# Files that belong to the recording.
 
 
 def _from_files(path: Path, *, reading: bool = True) -> Manifest:
-    """Of all segments beside ``path``. ``deleted`` counts the numbers that are
-    missing before the last. A folder that cannot be read has no segments unless
-    it has to be ``reading``. Raises OSError."""
+    """The manifest of all segments beside ``path``. ``deleted`` counts the missing
+    numbers before the last. An unreadable folder counts as empty unless ``reading``.
+    Raises OSError."""
     try:
         found = _inspected(path, numbered_files(path))
     except PermissionError:
@@ -137,31 +141,36 @@ def _from_files(path: Path, *, reading: bool = True) -> Manifest:
 
 
 def _reconciled(manifest: Manifest) -> tuple[Manifest, str]:
-    """The manifest of the files that are there, and what was wrong with it in
-    words; empty where nothing was. The last segment may be missing if it is
-    open: the manifest names it before it exists. Raises OSError."""
+    """The manifest of the files on the disk, and the differences in words; empty if
+    there are none. The last segment may be missing if it is open, as the manifest
+    lists it before it exists. Raises OSError."""
     try:
         there = numbered_files(manifest.path)
     except PermissionError:
         return manifest, ""
+    # Listed segments that are missing.
     last = manifest.segments[-1:]
     missing = [s for s in manifest.segments if not os.path.lexists(manifest.path_of(s))]
     missing = [s for s in missing if s.state != "open" or (s,) != last]
+    # Files that the manifest does not list.
     listed = {s.number for s in manifest.segments} | {
         number for number, name in there.items() if any(s.file == name for s in manifest.segments)
     }
     added = _inspected(manifest.path, {number: name for number, name in there.items() if number not in listed})
-    unsettled = [s for s in manifest.segments[: -1 if not added else None] if s.state == "open" and s not in missing]
-    if not (missing or added or unsettled):
+    # Segments that are listed as open though another one follows.
+    left_open = [s for s in manifest.segments[: -1 if not added else None] if s.state == "open" and s not in missing]
+    if not (missing or added or left_open):
         return manifest, ""
+    # Drop the missing ones, inspect the open ones, and add the unlisted ones.
     kept = [s for s in manifest.segments if s not in missing]
-    for segment in unsettled:
+    for segment in left_open:
         file = manifest.path_of(segment)
         kept[kept.index(segment)] = _with_digest(file, _on_disk(file, segment))
     merged = _with_unconfirmed(tuple(sorted([*kept, *added], key=lambda s: s.number)))
+    # Name up to three files of each kind.
     wrong = [
         f"{what} {', '.join(s.file for s in some[:3])}{f' and {len(some) - 3} more' if len(some) > 3 else ''}"
-        for what, some in (("lists missing", missing), ("does not list", added), ("lists as open", unsettled))
+        for what, some in (("lists missing", missing), ("does not list", added), ("lists as open", left_open))
         if some
     ]
     counts = Counter(manifest.deleted) + Counter({"missing": len(missing)})
@@ -169,41 +178,41 @@ def _reconciled(manifest: Manifest) -> tuple[Manifest, str]:
 
 
 def _inspected(path: Path, names: Mapping[int, str]) -> list[Segment]:
-    """Those of the numbered files that are segments of the manifest ``path``,
-    as they lie on the disk, in order. Raises OSError."""
-    found: list[tuple[Segment, Told]] = []
+    """The numbered files that are segments of the manifest ``path``, as they are on the
+    disk, in order. Raises OSError."""
+    found: list[tuple[Segment, Place]] = []
     for number, name in names.items():
         file = path.with_name(name)
         if not stat.S_ISREG(file.stat().st_mode if file.exists() else 0) or _nothing_reached(file):
             continue
-        told = _told(file)
-        if told is not None and told.get("number") != str(number):
+        place = _place_in(file)
+        if place is not None and place.get("number") != str(number):
             continue  # another recording has this name
-        first = _number(told or {}, "first", found[-1][0].end if found else 0)
-        found.append((_on_disk(file, Segment(name, number, first)), told or {}))
+        first = _number(place or {}, "first", found[-1][0].end if found else 0)
+        found.append((_on_disk(file, Segment(name, number, first)), place or {}))
     return [_with_digest(path.with_name(s.file), replace(s, sha256=sha256)) for s, sha256 in _with_known_digests(found)]
 
 
-def _with_known_digests(found: list[tuple[Segment, Told]]) -> list[tuple[Segment, str]]:
-    """Each segment with the digest that the next one was given of it when it
-    was closed, so that a later change is still found; empty where there is none."""
+def _with_known_digests(found: list[tuple[Segment, Place]]) -> list[tuple[Segment, str]]:
+    """Each segment with its digest from when it was closed, which the next segment
+    records, so that a later change is still found. Empty if there is none."""
     known = []
     for (segment, _), (_, after) in pairwise([*found, *([(found[-1][0], {})] if found else [])]):
-        said = after.get("previous_sha256", "") if after.get("previous") == segment.file else ""
-        known.append((segment, said if _SHA256.fullmatch(said) else ""))
+        digest = after.get("previous_sha256", "") if after.get("previous") == segment.file else ""
+        known.append((segment, digest if _SHA256.fullmatch(digest) else ""))
     return known
 
 
-def _number(told: Told, key: str, default: int) -> int:
-    return int(told[key]) if _DIGITS.fullmatch(told.get(key, "")) else default
+def _number(place: Place, key: str, default: int) -> int:
+    return int(place[key]) if _DIGITS.fullmatch(place.get(key, "")) else default
 
 
-# What is in a file
+# Contents of a file.
 
 
 def _on_disk(path: Path, segment: Segment) -> Segment:
-    """The segment as it is in its file, without the digest of the file: from
-    the summary of a finished one, else from its records. Raises OSError."""
+    """The segment as it is in its file, without the digest of the file. A finished file
+    is described by its summary, another one by its records. Raises OSError."""
     try:
         found = _by_summary(path, segment) or _by_records(path, segment)
     except (RecordingError, ValueError):
@@ -220,8 +229,8 @@ def _with_digest(path: Path, segment: Segment) -> Segment:
 
 
 def _nothing_reached(path: Path) -> bool:
-    """Whether of this file the disk has its name alone: the power failed right
-    after it was created."""
+    """Whether only the name of the file reached the disk, as after a power failure
+    right after its creation."""
     try:
         with td.files.open_file(path) as stream:
             return written_to(stream, size_of(stream)) == 0
@@ -230,7 +239,7 @@ def _nothing_reached(path: Path) -> bool:
 
 
 def _by_records(path: Path, segment: Segment) -> Segment:
-    """Reads the whole file. Raises RecordingError."""
+    """The segment by all records of its file. Raises RecordingError."""
     with Recording.open(path, unfinished=True) as recording:
         digest, span = schema.RawDigest(), list[int]()
         for phase, batch in recording.joined_batches():
@@ -247,13 +256,13 @@ def _by_records(path: Path, segment: Segment) -> Segment:
     )  # fmt: skip
 
 
-def _told(path: Path) -> Told | None:
-    """What the file says of its place among the segments; empty where it says
-    nothing, None where it cannot be read."""
+def _place_in(path: Path) -> Place | None:
+    """The file's record of its place among the segments; empty if it has none, None if
+    the file cannot be read."""
     with suppress(RecordingError, OSError), td.files.open_file(path) as stream:
         check_magic(stream, str(path))
         size, offset = size_of(stream), len(MAGIC)
-        # The metadata stand before the first chunk.
+        # The metadata come before the first chunk.
         while offset < size:
             unparsed = unparsed_at(stream, str(path), offset, size)
             if unparsed.opcode == Opcode.METADATA:
@@ -273,13 +282,13 @@ class _Summary(NamedTuple):
     statistics: Statistics
     channels: dict[int, str]
     chunks: list[ChunkIndex]
-    metadata: dict[str, int]  # offset by name
+    metadata: dict[str, int]  # by name, the offset of the record
 
 
 def _by_summary(path: Path, segment: Segment) -> Segment | None:
-    """From the end of a finished file, and the chunks in which its raw records
-    begin and end: to read all of a week of segments would take minutes. None
-    where the whole file has to be read. Raises RecordingError."""
+    """The segment by the summary of its file and the chunks with its first and last raw
+    records; reading a week of segments whole would take minutes. None if the whole
+    file has to be read. Raises RecordingError."""
     try:
         with td.files.open_file(path) as stream:
             name, size = str(path), size_of(stream)
@@ -303,8 +312,9 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
 
 
 def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
-    """None where the file has none, as one that is not finished. Raises
+    """None if the file has no valid summary, as an unfinished one. Raises
     RecordingError."""
+    # The footer precedes the magic bytes at the end of the file.
     footer_at = size - len(MAGIC) - HEAD.size - _FOOTER_BYTES
     stream.seek(size - len(MAGIC))
     if footer_at < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
@@ -312,11 +322,13 @@ def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
     footer = unparsed_at(stream, name, footer_at, size)
     if footer.opcode != Opcode.FOOTER or footer.end != size - len(MAGIC):
         return None
+    # It tells where the summary begins.
     end = parse(footer, name)
     assert isinstance(end, Footer)
     offset, crc, records = end.summary_start, 0, list[McapRecord]()
     if not len(MAGIC) <= offset < footer_at:
         return None
+    # Read the summary's records up to the footer, with their CRC.
     while offset < footer_at:
         unparsed = unparsed_at(stream, name, offset, size)
         crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
@@ -335,7 +347,8 @@ def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
 
 
 def _span_ns(stream: BinaryIO, name: str, size: int, summary: _Summary) -> tuple[int, int] | None:
-    """Host times of the first and the last raw record. Raises RecordingError."""
+    """Host times of the earliest and latest raw record [ns], by the first and the last
+    chunk with raw records. Raises RecordingError."""
     raw = {i for i, topic in summary.channels.items() if topic == schema.RAW}
     chunks = [chunk for chunk in summary.chunks if raw & set(chunk.message_index_offsets)]
     times = list[int]()

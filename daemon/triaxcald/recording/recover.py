@@ -1,5 +1,5 @@
-"""Mends a recording that was cut short or damaged: keeps every whole record and
-counts what is lost."""
+"""Recovers a recording that was cut short or damaged: keeps every whole record and
+counts the lost ones."""
 
 from __future__ import annotations
 
@@ -42,25 +42,24 @@ from triaxcald.recording.mcap_records import (
     unparsed_at,
     whole_chunk_head,
 )
-from triaxcald.recording.raw_batch import decode_raw
+from triaxcald.recording.schema import decode_raw
 
-# What can still be found in a damaged file: its readable records in order and the
-# stretches between them.
+# A damaged file as its readable records in order and the unreadable stretches between
+# them.
 
 _SEARCH_BLOCK = 2**20
 _TRIED_MOST, _TRIED_LEAST, _TRY = 8, 16 * 2**20, 256
-"""What looks like a record may be tried for so many times the file, and for so
-many bytes in any case, each try counting for its length and so many bytes more.
-In a file of ours, hardly any of its bytes look like one."""
-# Chunk, attachment, metadata or end of data, shorter than 4 GiB: its type and
-# the upper half of its length.
+"""Limit of the search for records: it may try `_TRIED_MOST` times the file's size plus
+`_TRIED_LEAST` bytes. A try counts for the record's length plus `_TRY` bytes. In a
+recording of triaxcal, hardly any other bytes look like a record."""
+# The start of a chunk, attachment, metadata or end of data shorter than 4 GiB: its
+# type and, four bytes later, the upper half of its length.
 _RECORD_START = re.compile(rb"[\x06\x09\x0c\x0f](?=[\s\S]{4}\x00\x00\x00\x00)")
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Bytes that are no whole record; ``at_end`` where nothing readable
-    follows."""
+    """Bytes that are no whole record. ``at_end``: nothing readable follows."""
 
     offset: int
     length: int
@@ -68,14 +67,14 @@ class Stretch:
 
 
 class DamagedFile:
-    """Raises RecordingError at birth where the file is no recording of ours."""
+    """The constructor raises RecordingError if the file is no recording of triaxcal."""
 
     def __init__(self, source: BinaryIO, name: str) -> None:
         self.name = name
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._source = source
-        self._tried = 0
+        self._bytes_tried = 0
         self.size = size_of(source)
         try:
             check_magic(source, name)
@@ -85,17 +84,18 @@ class DamagedFile:
         self._look_ahead()
 
     def pieces(self) -> Iterator[UnparsedRecord | Stretch]:
-        """Up to the end of the data and with it, or to the end of the file
-        where that is missing.
+        """Records and stretches up to and with the end of the data, or up to the end
+        of the file if that record is missing.
 
-        A chunk or attachment among them may still fail its CRC.
+        The CRC of a chunk or attachment is not checked here.
         """
         offset = len(MAGIC)
         while offset < self.size:
             try:
                 unparsed = unparsed_at(self._source, self.name, offset, self.size)
-                self._vet(unparsed)
+                self._check_length(unparsed)
             except Damage:
+                # Skip to the next record that is whole.
                 following = self._search(offset + 1)
                 yield Stretch(offset, following - offset, following >= self.size)
                 offset = following
@@ -110,37 +110,40 @@ class DamagedFile:
         return self._source.read(length)
 
     def declare(self, record: object) -> None:
-        """Notes a schema or channel."""
+        """Stores a schema or channel."""
         if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
 
-    def _vet(self, unparsed: UnparsedRecord) -> None:
-        """Raises Damage where the record's length cannot be right."""
+    def _check_length(self, unparsed: UnparsedRecord) -> None:
+        """Raises Damage if the record's length cannot be right."""
         if unparsed.opcode == Opcode.CHUNK:
             whole_chunk_head(unparsed, self.name)
         elif unparsed.opcode != Opcode.ATTACHMENT:
             parse(unparsed, self.name)
 
     def _search(self, offset: int) -> int:
-        """Where the next record begins that proves itself, from ``offset`` on;
-        the file's size if none."""
+        """Offset of the next valid record from ``offset`` on; the file's size if there
+        is none."""
         while offset < self.size:
+            # Blocks overlap by a record's head, so that no start is missed.
             block = self.read(offset, _SEARCH_BLOCK + HEAD.size)
             for found in _RECORD_START.finditer(block):
-                if found.start() < _SEARCH_BLOCK and self._proves_itself(offset + found.start()):
+                if found.start() < _SEARCH_BLOCK and self._is_record(offset + found.start()):
                     return offset + found.start()
             offset += _SEARCH_BLOCK
         return self.size
 
-    def _proves_itself(self, offset: int) -> bool:
-        self._tried += _TRY
-        if self._tried > _TRIED_MOST * self.size + _TRIED_LEAST:
+    def _is_record(self, offset: int) -> bool:
+        """Whether a valid record begins there. Raises RecordingError beyond the limit
+        of the search."""
+        self._bytes_tried += _TRY
+        if self._bytes_tried > _TRIED_MOST * self.size + _TRIED_LEAST:
             raise RecordingError(f"{self.name}: too much of it looks like records and is none")
         try:
             unparsed = unparsed_at(self._source, self.name, offset, self.size)
-            self._tried += len(unparsed.body)
+            self._bytes_tried += len(unparsed.body)
             if unparsed.opcode == Opcode.CHUNK:
                 chunk_data(unparsed, self.name)
             else:
@@ -150,8 +153,8 @@ class DamagedFile:
         return True
 
     def _look_ahead(self) -> None:
-        """Looks for what says whose file it is, and in the summary for what the
-        first chunk declared."""
+        """Reads the whole file once: checks that triaxcal wrote it, and takes from the
+        summary the schemas and channels that a lost first chunk declared."""
         profile: str | None = None
         ours = False
         for piece in self.pieces():
@@ -173,8 +176,8 @@ class DamagedFile:
             )
 
     def _read_summary(self, offset: int) -> None:
-        """Takes what it declares, if its CRC vouches for it; it only repeats
-        what the chunks say."""
+        """Takes the schemas and channels of the summary if its CRC is right. They only
+        repeat those of the chunks."""
         records, crc = [], 0
         try:
             unparsed = unparsed_at(self._source, self.name, offset, self.size)
@@ -192,18 +195,17 @@ class DamagedFile:
 
 @dataclass
 class Recovery:
-    """What was kept and what was lost.
+    """Counts of kept and lost records.
 
-    ``raw_records`` kept; ``raw_missing`` lost from the file by their running
-    index (at least: what was to come after the last one is unknown where
-    ``cut_short``); ``raw_dropped`` never reached it, by its own loss records.
-    ``chunks_failed`` and ``attachments_failed`` fail their CRC and are given
-    up. ``unverified_messages`` kept from a chunk that was cut off, where no CRC
-    can vouch for them. ``undeclared_messages`` given up because the chunk that
-    declares their type is lost. ``bytes_dropped`` of the file in no whole
-    record kept. ``unlocated_damage``: the CRC of the whole is wrong though no
-    chunk's or attachment's is, so that header or metadata may hold a wrong
-    byte.
+    ``raw_records`` were kept. ``raw_missing`` were lost from the file, by their
+    running index; a lower limit if ``cut_short``, as nothing tells how many were to
+    follow the last one. ``raw_dropped`` never reached the file, by its own loss
+    records. ``chunks_failed`` and ``attachments_failed`` fail their CRC and were
+    dropped. ``unverified_messages`` were kept from a chunk that was cut off, so no
+    CRC confirms them. ``undeclared_messages`` were dropped because the chunk that
+    declares their type is lost. ``bytes_dropped`` belong to no kept record.
+    ``unlocated_damage``: the CRC of the whole file is wrong though every chunk's and
+    attachment's is right, so header or metadata may have a wrong byte.
     """
 
     raw_records: int = 0
@@ -221,7 +223,7 @@ class Recovery:
 
     @property
     def lossless(self) -> bool:
-        """Whether all was there but for the end of the file and its indexes."""
+        """Whether only the end of the file and its indexes were missing."""
         return not (self.raw_missing or self.bytes_dropped or self.undeclared_messages or self.unlocated_damage)
 
 
@@ -235,12 +237,13 @@ class Sealed(NamedTuple):
 
 
 def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sealed | None = None) -> Recovery:
-    """Writes what can be had of ``path`` to ``out``, a finished recording, but for the
-    attachments ``without``; ``path`` is only read. ``sealed`` becomes its end.
+    """Writes all readable records of ``path`` to ``out``, a finished recording, but for
+    the attachments ``without``. ``path`` is only read. ``sealed`` becomes the end of
+    ``out``.
 
-    Raises RecordingError: ``path`` is no recording of ours or cannot be read,
-    ``out`` exists or cannot be written; Refused: ``path`` holds neither a whole
-    message nor an attachment. Nothing of ``out`` is left behind.
+    Raises RecordingError if ``path`` is no recording of triaxcal or cannot be read,
+    or if ``out`` exists or cannot be written. Raises Refused if ``path`` has neither
+    a whole message nor an attachment. An error leaves no ``out`` behind.
     """
     if is_manifest(path):
         raise RecordingError(f"{path}: is a manifest; mend each segment that it says is cut short or damaged")
@@ -256,30 +259,30 @@ def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sea
 
 def _write(damaged: DamagedFile, name: str, out: Path, without: Collection[str], sealed: Sealed | None) -> Recovery:
     with new_file(out) as sink:
-        recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True), without, sealed).run(name)
+        recovery = _Recoverer(damaged, McapWriter(sink, enable_data_crcs=True), without, sealed).run(name)
         if not (recovery.messages or recovery.attachments):
             raise tc.Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
         return recovery
 
 
-class _Mending:
-    """Carries record after record from the damaged file to the new one,
-    counting."""
+class _Recoverer:
+    """Copies the records of the damaged file to the new one and counts them."""
 
     def __init__(self, damaged: DamagedFile, mcap: McapWriter, without: Collection[str], sealed: Sealed | None) -> None:
         self._damaged, self._without, self._sealed = damaged, without, sealed
         self._mcap = mcap
         self._recovery = Recovery(cut_short=True)
-        self._channel_ids: dict[int, int] = {}  # of the damaged file -> of the new one
+        self._channel_ids: dict[int, int] = {}  # from those of the damaged file to those of the new one
         self._digest = schema.RawDigest()
         self._first = 0  # running index of the first record
-        self._raw_end = 0  # and after the last record known of
-        self._written: dict[str, str] = {}  # the metadata record `raw`, where the writer came to its end
-        self._located = False  # damage has been met
+        self._raw_end = 0  # running index after the last known record
+        self._written: dict[str, str] = {}  # the metadata record `raw`, if the writer finished the file
+        self._located = False  # whether damage was found at a known place
         self._unpacked = Unpacked(damaged.name, damaged.size)
 
     def run(self, name: str) -> Recovery:
         self._mcap.start(profile=schema.PROFILE)
+        # Copy every piece, with the CRC of the data section up to it.
         crc = zlib.crc32(MAGIC)
         for piece in self._damaged.pieces():
             if isinstance(piece, Stretch):
@@ -289,6 +292,7 @@ class _Mending:
             else:
                 crc = zlib.crc32(piece.body, zlib.crc32(piece.head, crc))
                 self._unparsed(piece)
+        # Count the missing records and finish the new file.
         self._count_missing()
         self._write_end(name)
         return self._recovery
@@ -326,18 +330,20 @@ class _Mending:
         self._first = self._first or schema.first_index({record.name: record.metadata})
 
     def _stretch(self, stretch: Stretch) -> None:
-        """Keeps what a chunk of the wrong length or one that was cut off still
-        holds."""
+        """Keeps the records of a chunk that has the wrong length or was cut off."""
         self._located = True
         body = self._damaged.read(stretch.offset, min(stretch.length, CHUNK_LIMIT))
         found = chunk_head(body[HEAD.size :]) if body[:1] == bytes([Opcode.CHUNK]) else None
         if found is None:
             self._recovery.bytes_dropped += stretch.length
             return
+        # A complete chunk in a record of the wrong length: its own CRC confirms it.
         chunk, length = found
         if len(chunk.data) == length and (data := unpack(chunk)) is not None:
             self._records(data)
             return
+        # A damaged chunk is dropped; of one that the end of the file cuts off, the
+        # first records are kept.
         self._recovery.bytes_dropped += stretch.length
         if len(chunk.data) == length:
             self._recovery.chunks_failed += 1
@@ -345,8 +351,7 @@ class _Mending:
             self._recovery.unverified_messages += self._records(unpack_part(chunk))
 
     def _records(self, data: bytes) -> int:
-        """Carries over a chunk's records; the number of messages among them
-        that were kept."""
+        """Copies a chunk's records. Returns the number of messages kept."""
         kept = 0
         try:
             for record in chunk_records(data):
@@ -355,7 +360,7 @@ class _Mending:
                     kept += self._message(record)
                 else:
                     self._damaged.declare(record)
-        except Damage:  # what follows is no record; the CRC, where there is one, says that it was written so
+        except Damage:  # no record follows; a right CRC means that the writer wrote it so
             self._recovery.chunks_failed += 1
         self._recovery.messages += kept
         return kept
@@ -368,7 +373,7 @@ class _Mending:
         try:
             self._count(channel.topic, message.data)
         except ValueError:
-            return False  # in a chunk that no CRC vouches for
+            return False  # from a chunk without a CRC
         if message.channel_id not in self._channel_ids:
             schema_id = self._mcap.register_schema(kind.name, kind.encoding, kind.data)
             self._channel_ids[message.channel_id] = self._mcap.register_channel(
@@ -384,7 +389,7 @@ class _Mending:
         return True
 
     def _declaration(self, channel_id: int) -> tuple[Channel | None, Schema | None]:
-        """What the file says of the channel, else what the format fixes."""
+        """The channel and its schema by the file, else by the format's fixed ids."""
         channel = self._damaged.channels.get(channel_id)
         if channel is not None:
             return channel, self._damaged.schemas.get(channel.schema_id)
@@ -398,7 +403,8 @@ class _Mending:
         )
 
     def _count(self, topic: str, data: bytes) -> None:
-        """Raises ValueError where ``data`` is not what the topic holds."""
+        """Counts raw records and losses. Raises ValueError if ``data`` is no message of
+        the topic."""
         if topic == schema.RAW:
             first, phase, batch = decode_raw(data)
             self._digest.update(phase, batch)
@@ -421,9 +427,9 @@ class _Mending:
         recovery.raw_records = self._digest.records
         by_index = self._raw_end - self._first - recovery.raw_records - recovery.raw_dropped
         written = self._written.get("records", "")
-        # No CRC but the whole's vouches for metadata.
-        believed = int(written) if written.isdecimal() and not recovery.unlocated_damage else 0
-        recovery.raw_missing = max(by_index, believed - recovery.raw_records, 0)
+        # Only the CRC of the whole file covers metadata.
+        by_metadata = int(written) if written.isdecimal() and not recovery.unlocated_damage else 0
+        recovery.raw_missing = max(by_index, by_metadata - recovery.raw_records, 0)
 
     def _write_end(self, name: str) -> None:
         ends_with = {schema.ENDS_WITH: self._digest.ends_with} if self._digest.ends_with else {}
@@ -436,8 +442,8 @@ class _Mending:
         if self._sealed is not None:
             digest = hashlib.sha256(self._sealed.data).hexdigest()
             self._mcap.add_metadata(schema.END_RECORD, {"name": self._sealed.name, "sha256": digest})
-        story = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
+        summary = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
         if "sha256" in self._written:
-            story["sha256_when_written"] = self._written["sha256"]
-        self._mcap.add_metadata(schema.RECOVERY_RECORD, story)
+            summary["sha256_when_written"] = self._written["sha256"]
+        self._mcap.add_metadata(schema.RECOVERY_RECORD, summary)
         self._mcap.finish()  # type: ignore[no-untyped-call]

@@ -21,27 +21,26 @@ import triaxcal_drivers as td
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
-from triaxcald.recording.file import Head, RecordingFile, ended_because
-from triaxcald.recording.manifest import Manifest, Segment, manifest_path
-from triaxcald.recording.rebuild import open_manifest, settled
-from triaxcald.recording.retention import SEGMENT_BYTES as SEGMENT_BYTES
-from triaxcald.recording.retention import SEGMENT_S as SEGMENT_S
-from triaxcald.recording.retention import Document, Retention, Surplus, delete, surplus
-from triaxcald.recording.series import digest_of
-from triaxcald.recording.writer import RecordingWriter
+from triaxcald.recording.manifest import SEGMENT_BYTES as SEGMENT_BYTES
+from triaxcald.recording.manifest import SEGMENT_S as SEGMENT_S
+from triaxcald.recording.manifest import Document, Manifest, Retention, Segment, Surplus, delete, manifest_path, surplus
+from triaxcald.recording.reader import digest_of
+from triaxcald.recording.rebuild import open_manifest, with_last_on_disk
+from triaxcald.recording.writer import Head, RecordingFile, RecordingWriter, ended_because
 
-# Which segments are kept because an outcome or a certificate beside them rests on
-# them: an index of those documents, each of which is read once.
+# Retention keeps a segment that an outcome or a certificate beside it names. An index
+# of those documents tells which; each document is read once.
 
 EVIDENCE = (".outcome.json", ".certificate.json")
-"""How the names of documents end that may rest on a recording."""
-EVIDENCE_MOST = 4 * 2**20  # bytes of one, as for any document
+"""Endings of the names of documents that may name a recording."""
+EVIDENCE_MOST = 4 * 2**20  # bytes of one document, as for any document
 SETTLED_NS = 2_000_000_000
-"""A file that was changed so lately may change again within one tick of the file
-system's clock, and look the same: it is read again."""
+"""Age [ns] from which an unchanged time stamp proves an unchanged file. A younger
+file may change again within one tick of the file system's clock, so it is read
+again."""
 NAMES_MOST = 4096
-"""Names and digests of one document that are held; ours have a dozen. One with
-more is read each time."""
+"""Most names and digests that the index stores for one document; ours have a
+dozen. A document with more is read each time."""
 FILE_NAME_MOST = 255
 DIGEST_DIGITS = 64  # of a SHA-256
 
@@ -51,15 +50,15 @@ _IS_HEX = np.isin(np.arange(256), np.frombuffer(b"0123456789abcdef", dtype=np.ui
 
 
 class RetainedFiles(NamedTuple):
-    """``kept`` are files that stay; ``unread`` is the document, or the folder,
-    that may name any of them."""
+    """``kept`` are the files that stay. ``unread`` is a document or folder that
+    cannot be read and may name any of them."""
 
     kept: frozenset[str]
     unread: str | None = None
 
 
 class _Stamp(NamedTuple):
-    """By which a file is known to be as it was."""
+    """File status that changes with every change of the file."""
 
     device: int
     inode: int
@@ -72,74 +71,80 @@ class _Stamp(NamedTuple):
         return _Stamp(status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
     @property
-    def settled(self) -> bool:
+    def old_enough(self) -> bool:
         now_ns = time.time_ns()
         return all(abs(now_ns - at_ns) > SETTLED_NS for at_ns in (self.modified_ns, self.changed_ns))
 
 
 class _Names(NamedTuple):
-    """What a document may name: runs of digits of digests, and the ends of its
-    text at each `.mcap`, written backwards."""
+    """Names in one document: runs of hexadecimal digits as long as a digest, and the
+    text before each `.mcap`, reversed for a search by prefix."""
 
     digests: frozenset[str]
     ends: frozenset[str]
 
 
 @dataclass
-class _All:
-    """The same of all documents that are indexed, to be searched."""
+class _CombinedNames:
+    """The names in all indexed documents, arranged for searches."""
 
     digests: frozenset[str] = frozenset()
-    long_runs: tuple[str, ...] = ()
-    ends: tuple[str, ...] = ()  # in order
-    documents: tuple[str, ...] = ()  # names of all documents, in order
+    long_runs: tuple[str, ...] = ()  # longer than a digest: one may contain it
+    ends: tuple[str, ...] = ()  # sorted
+    documents: tuple[str, ...] = ()  # names of all documents, sorted
 
     def names(self, segment: Segment) -> bool:
+        # By file name: of the document itself, or in its text.
         if _begins_one(self.documents, f"{Path(segment.file).stem}.") or _begins_one(self.ends, segment.file[::-1]):
             return True
-        told = [digest for digest in (segment.sha256, segment.raw_sha256) if digest]
-        return any(digest in self.digests or any(digest in run for run in self.long_runs) for digest in told)
+        # By digest: of the file, or of its raw records.
+        digests = [digest for digest in (segment.sha256, segment.raw_sha256) if digest]
+        return any(digest in self.digests or any(digest in run for run in self.long_runs) for digest in digests)
 
 
 def _begins_one(ordered: tuple[str, ...], beginning: str) -> bool:
+    """Whether one of the sorted texts begins so: the first that is not smaller is the
+    only candidate."""
     at = bisect_left(ordered, beginning)
     return at < len(ordered) and ordered[at].startswith(beginning)
 
 
 @dataclass(eq=False)
 class EvidenceIndex:
-    """Of the documents in one folder. From one look to the next only those are
-    read that are new, or changed; from any thread."""
+    """Index of the documents in one folder. Each call reads only new and changed
+    documents. Any thread may call."""
 
     folder: Path
     reads: int = 0
-    """Documents that have been read."""
-    _known: dict[str, tuple[_Stamp, _Names | None]] = field(default_factory=dict)
-    _all: _All = field(default_factory=_All)
+    """Number of documents read so far."""
+    _by_document: dict[str, tuple[_Stamp, _Names | None]] = field(default_factory=dict)
+    _combined_names: _CombinedNames = field(default_factory=_CombinedNames)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def of(self, manifest: Manifest) -> RetainedFiles:
-        """The files that an outcome or a certificate beside the manifest names,
-        by name or by digest; all, where such a document cannot be read, and
-        which that is."""
+        """The files that an outcome or a certificate beside the manifest names, by
+        name or by digest. All files if such a document cannot be read, with the
+        name of that document."""
         every = frozenset(s.file for s in manifest.segments)
         with self._lock:
             try:
-                unread = self._look()
+                unread = self._update()
                 if unread is not None:
                     return RetainedFiles(every, unread)
-                texts = self._texts(name for name, (_, names) in self._known.items() if names is None)
-                kept = {s.file for s in manifest.segments if self._all.names(s) or _is_in(s, texts)}
+                # Documents with too many names are searched as text.
+                texts = self._texts(name for name, (_, names) in self._by_document.items() if names is None)
+                kept = {s.file for s in manifest.segments if self._combined_names.names(s) or _is_in(s, texts)}
                 odd = [s for s in manifest.segments if s.file not in kept and not _is_indexed(s)]
+                # So are all documents for a segment whose digest has another form.
                 if odd:
-                    texts = self._texts(self._known)
+                    texts = self._texts(self._by_document)
                     kept |= {s.file for s in odd if _is_in(s, texts)}
             except _Unread as e:
                 return RetainedFiles(every, str(e))
             return RetainedFiles(frozenset(kept))
 
-    def _look(self) -> str | None:
-        """Brings the index up to date; what cannot be read, if anything."""
+    def _update(self) -> str | None:
+        """Updates the index. Returns what cannot be read; None if all can."""
         found: dict[str, tuple[_Stamp, _Names | None]] = {}
         try:
             with os.scandir(self.folder) as entries:
@@ -148,23 +153,25 @@ class EvidenceIndex:
             names = []
         except OSError:
             return str(self.folder)
+        # Take over the entries of unchanged documents and read the others.
         changed = False
         for name in names:
             path = self.folder / name
             try:
                 stamp = _Stamp.of(path.stat())
-                known = self._known.get(name)
-                if known is not None and known[0] == stamp and stamp.settled:
+                known = self._by_document.get(name)
+                if known is not None and known[0] == stamp and stamp.old_enough:
                     found[name] = known
                     continue
                 found[name] = stamp, _names_in(self._data(name))
                 changed = True
             except OSError:
-                if os.path.lexists(path):
+                if os.path.lexists(path):  # else it was deleted meanwhile
                     return name
-        if changed or found.keys() != self._known.keys():
-            self._known = found
-            self._all = _joined(found)
+        # Combine the names of all documents anew if any document changed.
+        if changed or found.keys() != self._by_document.keys():
+            self._by_document = found
+            self._combined_names = _combined(found)
         return None
 
     def _data(self, name: str) -> bytes:
@@ -184,18 +191,18 @@ class EvidenceIndex:
 
 
 class _Unread(Exception):
-    """A document that is there cannot be read."""
+    """An existing document cannot be read."""
 
 
 def _names_in(data: bytes) -> _Names | None:
-    """None where there are too many to be held."""
+    """None if there are more than `NAMES_MOST`."""
     digests = frozenset(_digests_in(data))
     text = data.decode("utf-8", "replace")
     ends = set()
     at = text.find(_SUFFIX)
     while at >= 0:
         end = at + len(_SUFFIX)
-        # The name of a file has no slash, and is no longer than this.
+        # A file name has no slash and at most `FILE_NAME_MOST` bytes.
         ends.add(text[max(0, end - FILE_NAME_MOST) : end].rpartition("/")[2][::-1])
         if len(ends) + len(digests) > NAMES_MOST:
             return None
@@ -204,31 +211,30 @@ def _names_in(data: bytes) -> _Names | None:
 
 
 def _digests_in(data: bytes) -> list[str]:
-    """The runs of hexadecimal digits that are long enough. Ten times as fast as
-    a regular expression, which begins anew at every digit of a number."""
+    """Runs of hexadecimal digits that are at least as long as a digest. Ten times as
+    fast as a regular expression, which starts again at every digit of a number."""
     edges = np.flatnonzero(np.diff(_IS_HEX[np.frombuffer(data, dtype=np.uint8)].astype(np.int8), prepend=0, append=0))
     starts, ends = edges[::2], edges[1::2]
     long = ends - starts >= DIGEST_DIGITS
     return [data[a:b].decode() for a, b in zip(starts[long].tolist(), ends[long].tolist(), strict=True)]
 
 
-def _joined(found: dict[str, tuple[_Stamp, _Names | None]]) -> _All:
+def _combined(found: dict[str, tuple[_Stamp, _Names | None]]) -> _CombinedNames:
     indexed = [names for _, names in found.values() if names is not None]
     runs = frozenset().union(*(names.digests for names in indexed))
     ends = frozenset().union(*(names.ends for names in indexed))
     long_runs = tuple(run for run in runs if len(run) > DIGEST_DIGITS)
-    return _All(runs, long_runs, tuple(sorted(ends)), tuple(sorted(found)))
+    return _CombinedNames(runs, long_runs, tuple(sorted(ends)), tuple(sorted(found)))
 
 
 def _is_indexed(segment: Segment) -> bool:
-    """Whether all that a document may call it by is of the kinds that are
-    indexed."""
+    """Whether the index covers every digest of the segment."""
     return all(_DIGEST.fullmatch(d) for d in (segment.sha256, segment.raw_sha256) if d)
 
 
 def _is_in(segment: Segment, texts: Iterable[str]) -> bool:
-    told = [name for name in (segment.file, segment.sha256, segment.raw_sha256) if name]
-    return any(name in text for text in texts for name in told)
+    names = [name for name in (segment.file, segment.sha256, segment.raw_sha256) if name]
+    return any(name in text for text in texts for name in names)
 
 
 _indexes: WeakValueDictionary[Path, EvidenceIndex] = WeakValueDictionary()
@@ -236,7 +242,7 @@ _indexes_lock = threading.Lock()
 
 
 def evidence_in(folder: Path) -> EvidenceIndex:
-    """The index of a folder, which all writers of this process share."""
+    """Index of a folder; all writers of this process share it."""
     with _indexes_lock:
         key = folder.absolute()
         index = _indexes.get(key)
@@ -251,18 +257,18 @@ DAMAGED = "what was recorded before is damaged, and nothing was being recorded m
 
 
 class SegmentedWriter(RecordingWriter):
-    """As `RecordingWriter`, into one file after the other: a new one begins when
-    the last has ``size_bytes`` or is ``time_s`` old. ``manifest`` is the file
-    that names them; where it is there already, the recording goes on behind
-    what it names, and where it cannot be used, behind the segments that are
-    there. ``path`` is the manifest, or an `.mcap` of that name.
+    """A `RecordingWriter` that writes one file after the other. A new segment begins
+    when the current one has ``size_bytes`` or is ``time_s`` old. ``manifest`` is the
+    file that lists the segments. If it exists, the recording continues after the
+    segments that it lists; if it cannot be used, after the segments on the disk.
+    ``path`` is the manifest, or an `.mcap` of that name.
 
-    Attachments that come before the first raw record are in every segment.
-    ``retention`` takes the oldest segments away; ``deleted`` are those, and
-    events of the current segment say it too. Their age is counted by the clock
-    and by ``steady_ns``, a line that no setting of the clock moves: the younger
-    counts, so that a clock set forward takes nothing away. Left as a context
-    manager it says by an event why it ended.
+    Every segment has the attachments written before the first raw record.
+    ``retention`` deletes the oldest segments. ``deleted`` lists them, and so do
+    events in the current segment. The age of a segment is the smaller one of its
+    ages by the clock and by ``steady_ns``, a time that no setting of the clock moves,
+    so a clock set forward deletes nothing. As a context manager, the writer records
+    by an event why it ended.
     """
 
     def __init__(
@@ -282,11 +288,11 @@ class SegmentedWriter(RecordingWriter):
         self._retention, self._steady_ns = retention, steady_ns
         self._evidence = evidence_in(self.manifest.parent)
         self._began_ns = self._retained_ns = steady_ns()
-        self._closed_ns: dict[int, int] = {}  # by number, on the steady line
+        self._closed_ns: dict[int, int] = {}  # by number, by the steady clock
         self._kept: list[tuple[int, str, str, bytes]] = []
-        self._recorded = self._told_low = False
+        self._recorded = self._low_reported = False
         self._unread: str | None = None
-        """A document that cannot be read, and keeps what else would go."""
+        """Document that cannot be read; it keeps segments that would be deleted."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
@@ -301,7 +307,7 @@ class SegmentedWriter(RecordingWriter):
         return self._unread
 
     @property
-    def _told(self) -> Path:
+    def _reported_path(self) -> Path:
         return self._file.path
 
     def _leave(self, error: BaseException | None) -> None:
@@ -310,13 +316,16 @@ class SegmentedWriter(RecordingWriter):
     def _begin(self, head: Head) -> RecordingFile:
         self._head = replace(head, metadata={name: dict(record) for name, record in head.metadata.items()})
         try:
+            # Continue the manifest on the disk, or one rebuilt from the segments.
             opened = open_manifest(self.manifest)
-            self._segments, self.warning = settled(opened.manifest), opened.warning
+            self._segments, self.warning = with_last_on_disk(opened.manifest), opened.warning
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
             damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
             self._resumes = td.Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
-            before, gone = self._segments, self._room_made()
+            # Make room before the first file of this writer.
+            before, gone = self._segments, self._delete_for_room()
             file = self._next(before)
+            # Record what happened in the new segment.
             if opened.warning is not None:
                 file.write(schema.EVENTS, self._event(REBUILT, {"because": opened.warning, "kept_as": opened.kept}))
             if gone:
@@ -325,34 +334,36 @@ class SegmentedWriter(RecordingWriter):
         except OSError as e:
             raise disk.not_created(self.manifest, e) from e
 
-    def _room_made(self) -> list[Surplus]:
-        """What had to go so that there is room for a file and its end; nothing
-        goes where that would not do. Raises DiskError."""
+    def _delete_for_room(self) -> list[Surplus]:
+        """Deletes segments until there is room for a file and its end; returns them.
+        Deletes none if even all do not suffice. Raises DiskError."""
         free, chosen = disk.free_bytes(self.manifest.parent), self._surplus()
         if free is None or free >= disk.END_BYTES:
             return []
         if free + sum(one.segment.bytes for one in chosen) < disk.END_BYTES:
             raise self._with_document(disk.no_room(self.manifest, free))
-        return self._take_away(chosen)
+        return self._delete(chosen)
 
-    # What follows runs on the writer's thread, but for the first segment.
+    # The following runs on the writer's thread, except for the first segment.
 
     def _next(self, before: Manifest | None = None) -> RecordingFile:
-        """Behind what was there ``before``, where not all of it is left. Raises
-        OSError, RecordingError."""
+        """The next segment. It continues ``before``, the manifest before a deletion, if
+        given. Raises OSError, RecordingError."""
         before = before or self._segments
+        # Choose a free number and the running index of the first record.
         known, number = before.segments, before.next_number
         if not known or os.path.lexists(before.path.with_name(before.file_name(number))):
             number = max(number, before.taken + 1)
         first = max((s.end for s in known), default=0)
-        told = {"number": str(number), "first": str(first), "of": self.manifest.name}
+        place = {"number": str(number), "first": str(first), "of": self.manifest.name}
         if known:
-            told |= {"previous": known[-1].file, "previous_sha256": known[-1].sha256}
-        head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: told})
+            place |= {"previous": known[-1].file, "previous_sha256": known[-1].sha256}
+        head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: place})
         segment = Segment(self._segments.file_name(number), number, first)
         path = self._segments.path_of(segment)
         require_new(path)
-        # Before the file is: one that no manifest names would be in the way for ever.
+        # Save the manifest before the file exists: a file that no manifest lists would
+        # block its name for ever.
         self._segments = self._segments.with_last(segment)
         self._segments.save()
         file = RecordingFile(path, head, clock_ns=self._clock_ns, sync_s=self._sync_s, first=first)
@@ -367,19 +378,20 @@ class SegmentedWriter(RecordingWriter):
             self._finish()
             self._finished = False
             self._file = self._next()
-            self._told_low = False
+            self._low_reported = False
             self._retain()
 
     def _idle(self) -> None:
-        """Nothing comes: earlier segments grow old, and others fill the disk."""
+        """Applies the retention without new records: earlier segments grow old, and
+        other programs fill the disk."""
         super()._idle()
         if not 0 <= self._steady_ns() - self._retained_ns < self._time_ns:
             self._retain()
 
     def _flushed(self) -> None:
         super()._flushed()
-        if not self._told_low and self._lacks() and not self._retain():
-            self._told_low = True
+        if not self._low_reported and self._lacks_room() and not self._retain():
+            self._low_reported = True
             wanted = self._retention.free_bytes if self._retention else 0
             unread = {} if self._unread is None else {"unread": self._unread}
             self._file.write(schema.EVENTS, self._event("disk_low", {"wanted_bytes": wanted, **unread}))
@@ -402,7 +414,7 @@ class SegmentedWriter(RecordingWriter):
         self._segments.save()
 
     def _end_for_lack_of_room(self, free: int) -> None:
-        """Unless older segments make room. Raises DiskError."""
+        """Ends the recording unless older segments make room. Raises DiskError."""
         if self._retain():
             return
         try:
@@ -411,17 +423,18 @@ class SegmentedWriter(RecordingWriter):
             raise self._with_document(e) from None
 
     def _with_document(self, e: DiskError) -> DiskError:
-        """Also with what keeps segments that could make room."""
+        """Adds the document that prevented a deletion, if any."""
         return DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") if self._unread else e
 
-    def _lacks(self) -> bool:
-        """Whether less of the disk is free than is to be."""
+    def _lacks_room(self) -> bool:
+        """Whether less of the disk is free than the retention demands."""
         free = disk.free_bytes(self.manifest.parent)
         return self._retention is not None and free is not None and free < self._retention.free_bytes
 
     def _age_ns(self, segment: Segment) -> int | None:
-        """By the clock, or on the steady line where that is less: since it was
-        closed by this writer, at least since this writer began."""
+        """Age by the clock or by the steady clock, whichever is less. The steady age
+        counts from the end of the segment, or from the start of this writer if an
+        earlier writer closed it."""
         closed_ns = segment.end_ns if segment.closed_ns is None else segment.closed_ns
         if closed_ns is None:
             return None
@@ -429,8 +442,8 @@ class SegmentedWriter(RecordingWriter):
         return min(self._clock_ns() - closed_ns, self._steady_ns() - steadily_ns)
 
     def _retain(self) -> list[Surplus]:
-        """What it has taken away, also said in the file."""
-        gone = self._take_away(self._surplus())
+        """Deletes surplus segments, records it by an event, and returns them."""
+        gone = self._delete(self._surplus())
         if gone:
             self._file.write(schema.EVENTS, self._deleted(gone))
         return gone
@@ -444,11 +457,12 @@ class SegmentedWriter(RecordingWriter):
             surplus, self._segments.segments, self._retention, age_ns=self._age_ns,
             free_bytes=disk.free_bytes(self.manifest.parent),
         )  # fmt: skip
+        # An unreadable document matters only if it keeps a segment that would go.
         self._unread = unread if unread is not None and choose(kept=()) else None
         return choose(kept=kept)
 
-    def _take_away(self, chosen: list[Surplus]) -> list[Surplus]:
-        """Those that are gone."""
+    def _delete(self, chosen: list[Surplus]) -> list[Surplus]:
+        """Deletes segments; returns those that were deleted."""
         gone = delete(self._segments, chosen)
         if gone:
             self._segments = self._segments.without([(one.segment, one.reason) for one in gone])
@@ -457,7 +471,7 @@ class SegmentedWriter(RecordingWriter):
         return gone
 
     def _deleted(self, gone: list[Surplus]) -> schema.Event:
-        return self._event("deleted", {"segments": [_told(one) for one in gone]})
+        return self._event("deleted", {"segments": [_detail_of(one) for one in gone]})
 
     def _event(self, kind: str, detail: Mapping[str, Any]) -> schema.Event:
         return schema.Event(self._clock_ns(), kind, json.dumps(detail, sort_keys=True))
@@ -468,19 +482,19 @@ class SegmentedWriter(RecordingWriter):
         super()._write_attachment(time_ns, name, media_type, data)
 
     def _write_unconfirmed(self, first: int, told: Mapping[str, str]) -> None:
-        """Also of segments that are closed already, in the manifest: the bytes
-        of their files stay as they are."""
+        """Marks records of closed segments too, in the manifest: the bytes of closed
+        files do not change."""
         super()._write_unconfirmed(first, told)
         self._segments = self._segments.unconfirmed_from(first)
         self._segments.save()
 
     def _write_raw(self, phase: str, first: int, batch: td.RawBatch) -> None:
         self._recorded = True
-        if not self._file.digest.records:  # the age of a segment counts from here: before was silence
+        if not self._file.digest.records:  # the age of a segment counts from its first record
             self._begun_ns = self._clock_ns()
         super()._write_raw(phase, first, batch)
 
 
-def _told(one: Surplus) -> dict[str, Any]:
+def _detail_of(one: Surplus) -> dict[str, Any]:
     s = one.segment
     return {"file": s.file, "because": one.reason, "bytes": s.bytes, "start_ns": s.start_ns, "end_ns": s.end_ns}

@@ -1,5 +1,5 @@
-"""What a finished recording's file consists of, record by record, and where its
-parts contradict each other."""
+"""Inventory of a finished recording's file, record by record, and the contradictions
+between its parts."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from mcap.records import (
 )
 
 from triaxcald.recording import schema
+from triaxcald.recording.manifest import Inventory
 from triaxcald.recording.mcap_records import HEAD, UnparsedRecord, chunk_data, chunk_records, parse, whole_chunk_head
-from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.retention import Inventory
+from triaxcald.recording.schema import decode_raw
 
 Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
 AFTER_THE_END = (schema.RAW_RECORD, schema.END_RECORD, schema.RECOVERY_RECORD)
-"""Metadata records that are written after the document that the recording ends
-with, and are in no inventory."""
+"""Metadata records that follow the recording's last document. No inventory has
+them."""
 _TOPICS = frozenset([*(topic for topic, _ in schema.CHANNELS), *schema.PREVIEWS])
 _INDEX_HEAD, _INDEX_ENTRY = struct.Struct("<HI"), struct.Struct("<QQ")
 _CHANNEL_AND_TIME = struct.Struct("<HIQ")
@@ -41,8 +41,8 @@ _CHANNEL_AND_TIME = struct.Struct("<HIQ")
 
 @dataclass(frozen=True)
 class Fault:
-    """Of what is in the file: ``kind`` of contradiction, ``part`` a topic, a
-    name or an index, how many records."""
+    """A contradiction in the file: its ``kind``, the ``part`` (a topic, a name or an
+    index), and the number of records."""
 
     kind: Kind
     part: str
@@ -51,9 +51,9 @@ class Fault:
 
 @dataclass
 class Survey:
-    """``inventory`` of all that is before the document that the recording ends
-    with, which is ``last`` among the attachments where all is well; ``faults``
-    of the file itself."""
+    """``inventory`` of everything before the recording's last document. In a correct
+    file that document is ``last`` among the attachments. ``faults`` are those of the
+    file itself."""
 
     inventory: Inventory = field(default_factory=Inventory)
     attachments: list[str] = field(default_factory=list)
@@ -65,12 +65,12 @@ class Survey:
 
 
 def survey(recording: Recording, end: str) -> Survey:
-    """``end`` names the attachment that the recording ends with. Raises
+    """``end`` is the name of the recording's last document, an attachment. Raises
     RecordingError."""
-    return _Surveying(recording, end).run()
+    return _Surveyor(recording, end).run()
 
 
-class _Surveying:
+class _Surveyor:
     def __init__(self, recording: Recording, end: str) -> None:
         self._recording, self._end = recording, end
         self._found = Survey()
@@ -81,13 +81,14 @@ class _Surveying:
         self._messages: Counter[int] = Counter()
         self._times_ns: tuple[int, int] | None = None
         self._raw_end = schema.first_index(recording.metadata)
-        self._gaps: list[tuple[int, int]] = []  # of running indices of raw records, first and end
-        self._lost: list[tuple[int, int]] = []  # and what is noted as lost
-        self._indices: list[Any] = []  # that the summary has to have
-        self._expected: dict[int, bytes] = {}  # message indices of the latest chunk by channel
+        self._gaps: list[tuple[int, int]] = []  # in the running index of raw records: first, end
+        self._lost: list[tuple[int, int]] = []  # running indices recorded as lost: first, end
+        self._indices: list[Any] = []  # records that the summary must have
+        self._expected: dict[int, bytes] = {}  # by channel, the message index of the latest chunk
         self._chunk: ChunkIndex | None = None
 
     def run(self) -> Survey:
+        # Survey the data section; collect the summary behind it.
         summary: list[tuple[UnparsedRecord, Any]] = []
         ended = False
         for unparsed in self._recording.unparsed_records():
@@ -99,6 +100,7 @@ class _Surveying:
             else:
                 self._data(unparsed)
         self._check_summary(summary)
+        # A name may occur once.
         for names in (self._found.attachments, self._metadata):
             for name, count in Counter(names).items():
                 self._counts["twice", name] += count - 1
@@ -136,7 +138,7 @@ class _Surveying:
         if record.name != self._end:
             self._found.inventory.attachment(record.name, record.media_type, record.log_time, record.data)
 
-    # Chunks and what they hold.
+    # Chunks and their records.
 
     def _records(self, unparsed: UnparsedRecord) -> None:
         name, head = self._recording.name, whole_chunk_head(unparsed, self._recording.name)
@@ -148,10 +150,12 @@ class _Surveying:
             message_index_offsets={}, message_start_time=head.message_start_time,
             uncompressed_size=head.uncompressed_size,
         )  # fmt: skip
+        # The message index that must follow the chunk.
         entries: dict[int, list[bytes]] = {}
         for at, channel_id, time_ns in _messages_in(data):
             entries.setdefault(channel_id, []).append(_INDEX_ENTRY.pack(time_ns, at))
         self._expected = {channel_id: b"".join(sorted(held)) for channel_id, held in entries.items()}
+        # Declarations and messages.
         times: list[int] = []
         for record in chunk_records(data):
             if isinstance(record, Schema):
@@ -162,6 +166,7 @@ class _Surveying:
             else:
                 times.append(record.log_time)
                 self._message(record)
+        # The chunk's own record of its time span.
         if times and (min(times), max(times)) != (head.message_start_time, head.message_end_time):
             self._counts["index", "chunk"] += 1
         if times:
@@ -187,6 +192,7 @@ class _Surveying:
         self._found.inventory.message(topic, message.log_time, message.publish_time, message.data)
         if message.sequence:
             self._counts["sequence", topic] += 1
+        # A message carries its own time, which both MCAP times repeat.
         try:
             own_ns = self._raw(message) if topic == schema.RAW else schema.decode_time(message.data)
             if topic == schema.LOSS:
@@ -199,7 +205,7 @@ class _Surveying:
             self._counts["times", topic] += 1
 
     def _raw(self, message: Message) -> int:
-        """Its own time, which is that of its last record."""
+        """Checks the running index. Returns the time of the last record [ns]."""
         first, _, batch = decode_raw(message.data)
         if first != self._raw_end:
             self._gaps.append((self._raw_end, first))
@@ -226,6 +232,7 @@ class _Surveying:
         self._chunk, self._expected = None, {}
 
     def _check_summary(self, summary: list[tuple[UnparsedRecord, Any]]) -> None:
+        # Sort the summary into its records, its groups and the offsets of the groups.
         wanted = [*self._schemas.values(), *self._channels.values(), self._statistics(), *self._indices]
         groups: dict[int, tuple[int, int]] = {}
         offsets: list[tuple[int, int, int]] = []
@@ -237,17 +244,19 @@ class _Surveying:
                 start, length = groups.get(unparsed.opcode, (unparsed.offset, 0))
                 groups[unparsed.opcode] = start, length + unparsed.end - unparsed.offset
                 found.append(record)
+        # Compare records by kind, and groups by offset.
         for kind in (Schema, Channel, Statistics, ChunkIndex, AttachmentIndex, MetadataIndex):
             has, should = ([r for r in some if isinstance(r, kind)] for some in (found, wanted))
             if has != should:
                 self._counts["index", _NAMES[kind]] += 1
         if {o for o in offsets if o[2]} != {(code, *place) for code, place in groups.items()}:
             self._counts["index", "groups"] += 1
-        self._counts["running_index", schema.RAW] += sum(not self._is_noted(*gap) for gap in self._gaps)
+        # A gap in the running index must be recorded as a loss.
+        self._counts["running_index", schema.RAW] += sum(not self._is_recorded_as_lost(*gap) for gap in self._gaps)
 
-    def _is_noted(self, first: int, end: int) -> bool:
-        """Whether the raw records between two running indices are noted as
-        lost."""
+    def _is_recorded_as_lost(self, first: int, end: int) -> bool:
+        """Whether the loss records cover the raw records between two running
+        indices."""
         if end < first:
             return False
         for begin, until in sorted(self._lost):
@@ -277,8 +286,7 @@ _NAMES: dict[type, str] = {
 
 
 def _messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Of each message in a chunk: where it begins, its channel and its log
-    time."""
+    """Offset, channel and log time [ns] of each message in a chunk."""
     at = 0
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)

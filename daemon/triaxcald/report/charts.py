@@ -1,14 +1,20 @@
-"""The bars of every step against the noise floor, and the raw streams."""
+"""The charts of the page as inline SVG that takes its colours from the page, light or
+dark: the bars of every step against the noise floor, the raw streams, the spheres."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
+import matplotlib
+import matplotlib.style
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
@@ -19,10 +25,84 @@ from numpy.typing import ArrayLike, NDArray
 
 import triaxcal as tc
 from triaxcald.report.document import CANDIDATE, Finding, HoldOut, Outcome, Pose, Stage, mapping, texts
-from triaxcald.report.figures import MICRO_G, chance, clean, micro, micro_g, number, unit_label
-from triaxcald.report.ink import AFTER, AXES, BAND, FLOOR, GRID, INK, MUTED, draw, hang_grid
-from triaxcald.report.meanings import run_of
-from triaxcald.report.over_time import stage_colours
+from triaxcald.report.figures import MICRO_G, chance, clean, micro, micro_g, number, run_of, unit_label
+
+# From a matplotlib figure to inline SVG.
+
+# Stand-ins that occur nowhere else in a drawing; the page's style sheet gives
+# them their colours.
+INK, MUTED, GRID, PAPER = "#010101", "#010102", "#010103", "#010104"
+BEFORE, STEP, AFTER, FLOOR = "#010105", "#010106", "#010107", "#010108"
+AXES = ("#010109", "#01010a", "#01010b")
+BAND = "#01010c"
+_VARIABLES = {
+    INK: "ink", MUTED: "muted", GRID: "grid", PAPER: "paper", BEFORE: "before", STEP: "step",
+    AFTER: "after", FLOOR: "floor", AXES[0]: "x", AXES[1]: "y", AXES[2]: "z", BAND: "band",
+}  # fmt: skip
+
+_STYLE = {
+    "svg.fonttype": "none",
+    "text.parse_math": False,
+    "font.family": ["sans-serif"],
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "legend.frameon": False,
+}
+_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+
+
+def draw(name: str, alt: str, size_in: tuple[float, float], paint: Callable[[Figure], None]) -> Markup:
+    """Inline SVG of what `paint` draws, `alt` read aloud in its place.
+
+    The same drawing gives the same bytes; `name` keeps the ids of several
+    drawings on a page apart.
+    """
+    with matplotlib.style.context(["default", {**_STYLE, "svg.hashsalt": name}]):
+        figure = Figure(figsize=size_in, layout="constrained")
+        paint(figure)
+        sheet = io.StringIO()
+        figure.savefig(sheet, format="svg", metadata=_NO_METADATA)
+    return _inline(sheet.getvalue(), name, alt)
+
+
+def hang_grid(axes: Axes, axis: Literal["x", "y"] = "y") -> None:
+    axes.grid(True, axis=axis)
+    axes.tick_params(length=2.5, width=0.6)
+
+
+def _inline(svg: str, name: str, alt: str) -> Markup:
+    body = svg[svg.index("<svg") :]
+    head, body = body.split(">", 1)
+    box = re.search(r'viewBox="[^"]*"', head)
+    body = re.sub(r"<style[^>]*>.*?</style>", "", body, count=1, flags=re.DOTALL)
+    body = body.replace("xlink:href=", "href=")
+    body = re.sub(r'( id="| href="#|url\(#)', rf"\g<1>{name}-", body)
+    body = re.sub("|".join(_VARIABLES), lambda found: f"var(--{_VARIABLES[found[0]]})", body)
+    return Markup('<svg role="img" aria-label="{}" {}><title>{}</title>{}').format(
+        escape(alt), Markup(box[0] if box else ""), escape(alt), Markup(body.strip())
+    )
+
 
 # The raw readings as the page shows them: few enough points to draw, no extreme
 # lost.
@@ -142,6 +222,15 @@ def _of_output(stream: StreamOverview, axis: int) -> Markup:
 
     alt = f"Raw output {'xyz'[axis]} over time with {len(stream.spans)} still spans shaded"
     return draw(f"stream{axis}", alt, (4.2, 2.2), paint)
+
+
+def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
+    colours = {stage.label: STEP for stage in stages}
+    if len(stages) > 1:
+        colours[stages[0].label] = BEFORE
+    if stages:
+        colours[stages[-1].label] = AFTER
+    return colours
 
 
 def _bar_groups(stages: Sequence[Stage], held_out: HoldOut | None) -> list[Group]:

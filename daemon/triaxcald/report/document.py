@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 import triaxcal as tc
 from triaxcald.caveats import is_passing
-from triaxcald.report.figures import clean, micro_g, number
-from triaxcald.report.meanings import QUALITY
+from triaxcald.report.figures import QUALITY, clean, micro_g, number
 from triaxcald.schema.certificate import RegisterWord
 
 # Values of a document, read without trust: what is missing or of the wrong kind

@@ -14,9 +14,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 import triaxcal as tc
+from triaxcald.report.charts import BAND, FLOOR, INK, MUTED, draw, hang_grid, stage_colours
 from triaxcald.report.document import Pose, Stage
 from triaxcald.report.figures import MICRO_G, clean, unit_label
-from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8
@@ -116,15 +116,6 @@ def time_panels(
         for channel, values in _moving_channels(poses).items()
     ]
     return tuple(panel(title, alt, number, fill) for number, (title, alt, fill) in enumerate(panels))
-
-
-def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
-    colours = {stage.label: STEP for stage in stages}
-    if len(stages) > 1:
-        colours[stages[0].label] = BEFORE
-    if stages:
-        colours[stages[-1].label] = AFTER
-    return colours
 
 
 def _places(poses: Sequence[Pose]) -> tuple[NDArray[np.float64], str]:

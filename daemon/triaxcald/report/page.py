@@ -32,8 +32,7 @@ from triaxcald.report.charts import (
     trace_panels,
 )
 from triaxcald.report.document import faults_of, left_out, mapping, numbers, read_device, read_document, texts, vector
-from triaxcald.report.figures import number
-from triaxcald.report.meanings import factor, in_plain, told
+from triaxcald.report.figures import factor, in_plain, number, told
 from triaxcald.report.over_time import time_pictures
 from triaxcald.report.verdict import before_after, choices_in, final_word, judge, who_corrects
 

@@ -21,8 +21,7 @@ from triaxcald.report.document import (
     residual_of,
     texts,
 )
-from triaxcald.report.figures import chance, micro_g, p_value, ratio
-from triaxcald.report.meanings import told
+from triaxcald.report.figures import chance, micro_g, p_value, ratio, told
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"

@@ -16,7 +16,7 @@ from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, identified
 from triaxcald.provision.registers import Snapshot, take_snapshot
-from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
+from triaxcald.recording.manifest import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.reasons import code_of

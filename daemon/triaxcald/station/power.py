@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 
 from triaxcald import text
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.power import least_off_s, power_cycled
+from triaxcald.provision.restart_check import least_off_s, power_cycled
 from triaxcald.schema.codes import Stage
 from triaxcald.station.config import Place, Station
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 import triaxcal_drivers as td
 from triaxcald.errors import InputError
-from triaxcald.recording.export import Rows, require_alike
 from triaxcald.tables.layout import DATED, DAY_TIME, MISSING, MOMENT
+from triaxcald.tables.native_csv import Rows, require_alike
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -315,7 +315,7 @@ def _as_moments(texts: pa.Array, kind: pa.DataType) -> pa.Array:
 
 
 def write_parquet(path: Path, blocks: Iterable[Rows], start_ns: int | None = None) -> int:
-    """As `triaxcald.recording.export.write_csv`, times in seconds as floats;
+    """As `triaxcald.tables.native_csv.write_csv`, times in seconds as floats;
     the number of samples. ``path`` is overwritten. Raises RecordingError,
     OSError."""
     import pyarrow as pa  # 50 MB that nothing else needs

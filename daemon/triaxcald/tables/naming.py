@@ -3,8 +3,7 @@ says, or as everybody calls them.
 
 Nothing is guessed where two guesses are possible: `Unclear` says what, and the
 message names the option that settles the question. No number of the table is
-looked at here.
-"""
+looked at here."""
 
 from __future__ import annotations
 
@@ -14,7 +13,73 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 import triaxcal_drivers as td
-from triaxcald.tables import words as known
+
+# The words that programs call columns by, in lower case, and the units that they
+# write behind them.
+
+UNITS_OF_TIME = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden", "secondes", "segundos"), "s"),
+    **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"), "ns"),
+}
+"""As `--time-unit` has them."""
+OTHER_UNITS_OF_TIME = frozenset(
+    ("min", "mins", "minute", "minutes", "minuten", "h", "hr", "hrs", "hour", "hours", "stunden", "day", "days", "tage")
+)
+TIMES = frozenset((
+    "t", "ts", "time", "times", "timestamp", "timestamps", "zeit", "zeitstempel", "uhrzeit", "temps", "tiempo", "tempo",
+    "elapsed", "date", "datetime", "epoch", "epoc", "clock", "heure", "hora", "stamp", "uptime", "utc",
+    *(word for word in UNITS_OF_TIME if len(word) > 3),
+))  # fmt: skip
+INDICES = frozenset((
+    "index", "idx", "sample", "samples", "count", "counter", "n", "no", "nr", "num", "number", "nummer", "id", "row",
+    "frame", "packet", "pose", "poses", "seq", "sequence", "record", "unnamed", "level", "lfd", "i", "k",
+))  # fmt: skip
+ACCELERATION = frozenset((
+    "a", "acc", "accel", "accelero", "acceleration", "accelerometer", "accelerations", "accelerometers", "gforce", "gf",
+    "beschleunigung", "beschl", "acel", "aceler", "aceleracion", "aceleración", "accélération", "accelerazione",
+))  # fmt: skip
+UNITS_OF_ACCELERATION = frozenset(
+    ("g", "mg", "ug", "µg", "m/s2", "m/s^2", "m/s**2", "m/s²", "m/s/s", "m*s^-2", "ms-2", "g0", "gn")
+)
+OTHER_SENSORS = frozenset((
+    "g", "gyr", "gyro", "gyros", "gyroscope", "w", "omega", "rotation", "rot", "rate", "angular", "angvel", "drehrate",
+    "m", "mag", "magn", "magnet", "magnetometer", "magnetic", "b", "field", "compass", "geomagnetic",
+))  # fmt: skip
+UNITS_OF_OTHERS = frozenset((
+    "deg/s", "°/s", "dps", "mdps", "rad/s", "ut", "µt", "μt", "nt", "mt", "t", "gauss", "mgauss", "m/s", "m", "°",
+    "deg", "rad",
+))  # fmt: skip
+OTHER_UNITS = frozenset(("v", "mv", "uv", "µv", "a", "ma", "hz", "counts", "count", "lsb", "raw", "pa", "hpa", "%"))
+COMPUTED = frozenset((
+    "gravity", "grav", "quat", "quaternion", "q", "orientation", "attitude", "euler", "roll", "pitch", "yaw", "heading",
+    "azimuth", "tilt", "inclination", "angle", "norm", "magnitude", "absolute", "abs", "total", "resultant", "svm",
+    "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta", "dt",
+))  # fmt: skip
+"""Of columns that are computed from the outputs, or from the motion of the
+whole."""
+TURNED = frozenset(("earth", "world", "global", "ned", "enu", "nav", "geo"))
+"""Of readings that were turned into another frame than the sensor's."""
+NOT_CELSIUS = frozenset(("f", "fahrenheit", "k", "kelvin", "raw", "mv", "v", "adc", "counts", "lsb", "code"))
+UNCERTAINTIES = frozenset(
+    ("se", "sem", "std", "sd", "stderr", "stdev", "sigma", "error", "err", "unc", "uncertainty", "var")
+)
+WITHOUT_GRAVITY = frozenset(
+    ("linear", "lin", "linacc", "linaccel", "user", "useracceleration", "free", "freeacc", "dynamic")
+)
+BESIDE_AN_AXIS = frozenset(
+    ("axis", "achse", "axe", "eje", "asse", "value", "cal", "calibrated", "raw", "data", "sensor", "imu")
+)
+"""Words that say nothing of the quantity."""
+NUMBERED = frozenset(
+    ("a", "acc", "accel", "ch", "chan", "channel", "adc", "ain", "ai", "in", "u", "v", "axis", "out", "kanal", "c")
+)
+"""Before the numbers of an ADC's channels."""
+TEMPERATURE = frozenset(("temp", "temperature", "temperatur", "température", "temperatura"))
+ELSEWHERE = frozenset(("gps", "location", "motion", "altimeter"))
+"""Sensors that have times of their own, and no three axes."""
+
 
 OUTPUTS = ("ux", "uy", "uz")
 ERRORS = ("se_ux", "se_uy", "se_uz")
@@ -58,7 +123,7 @@ class Name:
             stated, without = [slash[1]], without[: slash.start()]
         words = [w.lower() for w in _WORD.findall(_CAMEL.sub(" ", without).replace("_", " "))]
         unit = next((s.strip() for s in reversed(stated) if _is_unit(s.strip())), "") or _in_brackets(unit)
-        if not unit and len(words) > 1 and words[-1] in {*known.UNITS_OF_TIME, *known.OTHER_UNITS_OF_TIME}:
+        if not unit and len(words) > 1 and words[-1] in {*UNITS_OF_TIME, *OTHER_UNITS_OF_TIME}:
             unit = words.pop()
         return cls(bare, tuple(words), unit, next((s.strip() for s in reversed(stated) if s.strip()), ""))
 
@@ -66,14 +131,14 @@ class Name:
     def is_time(self) -> bool:
         if self.is_celsius and self.unit:
             return False
-        called = {w for w in self.words if len(w) > 2 or len(self.words) == 1} & known.TIMES
+        called = {w for w in self.words if len(w) > 2 or len(self.words) == 1} & TIMES
         return bool(called) or self.words == ("x", "value") or self.time_unit is not None
 
     @property
     def is_index(self) -> bool:
-        counts = all(w in known.INDICES or w.isdecimal() for w in self.words) and bool(set(self.words) & known.INDICES)
+        counts = all(w in INDICES or w.isdecimal() for w in self.words) and bool(set(self.words) & INDICES)
         last = self.words[-1] if self.words else ""
-        return not self.is_time and (counts or not self.words or (len(last) > 2 and last in known.INDICES - {"number"}))
+        return not self.is_time and (counts or not self.words or (len(last) > 2 and last in INDICES - {"number"}))
 
     @property
     def time_unit(self) -> str | None:
@@ -81,10 +146,10 @@ class Name:
         anybody calls a time."""
         if self.text == "t_s":
             return None
-        stated = known.UNITS_OF_TIME.get(self.unit.lower())
+        stated = UNITS_OF_TIME.get(self.unit.lower())
         if stated or len(self.words) == 1:
-            return stated or known.UNITS_OF_TIME.get(self.words[0])
-        return next((known.UNITS_OF_TIME[w] for w in self.words if len(w) > 1 and w in known.UNITS_OF_TIME), None)
+            return stated or UNITS_OF_TIME.get(self.words[0])
+        return next((UNITS_OF_TIME[w] for w in self.words if len(w) > 1 and w in UNITS_OF_TIME), None)
 
     @property
     def unknown_unit(self) -> bool:
@@ -95,19 +160,19 @@ class Name:
     @property
     def other_time_unit(self) -> str | None:
         """Minutes, hours and days, which no logger means and spreadsheets do."""
-        return self.unit if self.unit.lower() in known.OTHER_UNITS_OF_TIME else None
+        return self.unit if self.unit.lower() in OTHER_UNITS_OF_TIME else None
 
     @property
     def is_of_another_sensor(self) -> bool:
-        return bool(set(self.words) & (known.OTHER_SENSORS | known.COMPUTED | known.ELSEWHERE))
+        return bool(set(self.words) & (OTHER_SENSORS | COMPUTED | ELSEWHERE))
 
     @property
     def is_without_gravity(self) -> bool:
-        return bool(set(self.words) & known.WITHOUT_GRAVITY)
+        return bool(set(self.words) & WITHOUT_GRAVITY)
 
     @property
     def is_computed(self) -> bool:
-        return "angular" not in self.words and bool(set(self.words) & (known.COMPUTED | known.TURNED | known.ERRORS))
+        return "angular" not in self.words and bool(set(self.words) & (COMPUTED | TURNED | UNCERTAINTIES))
 
     @property
     def is_either(self) -> bool:
@@ -118,7 +183,7 @@ class Name:
     @property
     def is_celsius(self) -> bool:
         """A temperature whose unit is no other than the degree Celsius."""
-        called = (set(self.words) & known.TEMPERATURE and not set(self.words) & known.NOT_CELSIUS) or self.is_either
+        called = (set(self.words) & TEMPERATURE and not set(self.words) & NOT_CELSIUS) or self.is_either
         return bool(called) and self.unit.lower().lstrip("°º").removeprefix("deg").strip() in ("", "c", "celsius")
 
 
@@ -322,30 +387,30 @@ def _triples(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
 def _triple(names: Sequence[Name], columns: tuple[int, ...], at: int) -> Triple:
     """``at`` is where the axis stands in the names."""
     first = names[columns[0]]
-    words = set(Name.of(first.text[:at] + " " + first.text[at + 1 :]).words) - known.BESIDE_AN_AXIS
+    words = set(Name.of(first.text[:at] + " " + first.text[at + 1 :]).words) - BESIDE_AN_AXIS
     kind = _kind(words, first.unit.lower().replace(" ", ""))
     alone = next(iter(words)) if len(words) == 1 and not first.unit else ""
     return Triple((columns[0], columns[1], columns[2]), kind, not words, alone if len(alone) == 1 else "")
 
 
 def _kind(words: set[str], unit: str) -> Kind:
-    if words & known.ERRORS:
+    if words & UNCERTAINTIES:
         return Kind.COMPUTED
-    if words & known.WITHOUT_GRAVITY:
+    if words & WITHOUT_GRAVITY:
         return Kind.WITHOUT_GRAVITY
     if (
-        words & known.TURNED
-        or (words & (known.COMPUTED - {"velocity", "total"}))
+        words & TURNED
+        or (words & (COMPUTED - {"velocity", "total"}))
         or ("velocity" in words and "angular" not in words)
     ):
         return Kind.COMPUTED
-    if words & known.ACCELERATION or {"g", "force"} <= words or {"g", "f"} <= words:
+    if words & ACCELERATION or {"g", "force"} <= words or {"g", "f"} <= words:
         return Kind.ACCELERATION
-    if any(len(w) > 1 for w in words & known.OTHER_SENSORS):  # its mG are milligauss
+    if any(len(w) > 1 for w in words & OTHER_SENSORS):  # its mG are milligauss
         return Kind.OTHER_SENSOR
-    if unit in known.UNITS_OF_ACCELERATION:
+    if unit in UNITS_OF_ACCELERATION:
         return Kind.ACCELERATION
-    if words & known.OTHER_SENSORS or unit in known.UNITS_OF_OTHERS:
+    if words & OTHER_SENSORS or unit in UNITS_OF_OTHERS:
         return Kind.OTHER_SENSOR
     return Kind.NOT_KNOWN
 
@@ -363,7 +428,7 @@ def _numbered(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
         numbers, columns = [n for n, _ in numbered], [i for _, i in numbered]
         in_order = len(numbers) == len(AXES) and numbers == list(range(numbers[0], numbers[0] + len(AXES)))
         words = set(Name.of(stem).words)
-        if in_order and (stem.lower() in known.NUMBERED or words & known.ACCELERATION):
+        if in_order and (stem.lower() in NUMBERED or words & ACCELERATION):
             kind = _kind(words, names[columns[0]].unit.lower())
             triples.append(Triple((columns[0], columns[1], columns[2]), kind, not words))
     return triples
@@ -372,12 +437,12 @@ def _numbered(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
 def _is_unit(text: str) -> bool:
     folded = text.strip().lower().replace(" ", "")
     return (
-        folded in known.UNITS_OF_TIME
-        or folded in known.OTHER_UNITS_OF_TIME
-        or folded in known.UNITS_OF_ACCELERATION
-        or folded in known.UNITS_OF_OTHERS
+        folded in UNITS_OF_TIME
+        or folded in OTHER_UNITS_OF_TIME
+        or folded in UNITS_OF_ACCELERATION
+        or folded in UNITS_OF_OTHERS
         or folded.lstrip("°º").removeprefix("deg") in ("c", "f", "k", "celsius", "fahrenheit", "kelvin")
-        or folded in known.OTHER_UNITS
+        or folded in OTHER_UNITS
     )
 
 

@@ -1,23 +1,84 @@
-"""Reads samples from the native CSV: fast for valid files, exact about the first
-fault of others."""
+"""The native CSV: reads samples from it, fast for valid files, exact about the first
+fault of others; writes it for `triaxcal log export` and `triaxcal apply`."""
 
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import re
+import sys
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.errors import InputError
-from triaxcald.tables.source import blocks, label_of
+from triaxcald.errors import InputError, RecordingError
+
+# The bytes of a table, a few MiB at a time: of a file, a gzip file, a pipe or
+# standard input.
+
+BLOCK = 2**22
+EXPANSION_MOST = 200
+"""So many times what is read of it may a gzip file unpack to, and one block.
+Text of numbers comes to a third or a tenth, with two hundred columns that never
+change to a hundredth; nothing but one and the same, to a thousandth."""
+
+
+def label_of(name: str) -> str:
+    return "standard input" if name == "-" else name
+
+
+def blocks(source: Path | str | BinaryIO, label: str) -> Iterator[bytes]:
+    """Of a file, ``.gz`` unpacked, of standard input (``-``) or of a stream.
+    Raises InputError."""
+    if not isinstance(source, Path | str):
+        yield from _of(source, label)
+    elif str(source) == "-":
+        yield from _of(sys.stdin.buffer, label)
+    else:
+        packed = str(source).endswith(".gz")
+        try:
+            with td.files.open_file(Path(source), pipe=not packed) as file:
+                if packed:
+                    with gzip.GzipFile(fileobj=file) as unzipped:
+                        yield from _of(unzipped, label, file)
+                else:
+                    yield from _of(file, label)
+        except OSError as e:
+            raise InputError(f"{label}: cannot be read: {e.strerror or e}") from e
+
+
+def whole_lines(first: bytes) -> bytes:
+    """Of the first block: it may end within a line, and within a letter."""
+    return first[: first.rfind(b"\n") + 1] or first if len(first) >= BLOCK else first
+
+
+def _of(stream: BinaryIO | gzip.GzipFile, label: str, packed: BinaryIO | None = None) -> Iterator[bytes]:
+    unpacked = 0
+    while block := _block(stream, label):
+        unpacked += len(block)
+        if packed is not None and unpacked > EXPANSION_MOST * packed.tell() + BLOCK:
+            raise InputError(f"{label}: unpacks to more than {EXPANSION_MOST} times its size")
+        yield block
+
+
+def _block(stream: BinaryIO | gzip.GzipFile, label: str) -> bytes:
+    try:
+        return stream.read(BLOCK)
+    except EOFError:
+        raise InputError(f"{label}: the gzip data end too early, expected a whole file") from None
+    except (gzip.BadGzipFile, zlib.error) as e:
+        raise InputError(f"{label}: not readable as gzip: {e}") from e
+
+
+# Reading.
 
 REQUIRED = ("t_s", "ux", "uy", "uz")
 _LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
@@ -262,3 +323,80 @@ class _Parse:
         self._before = rows[-1]
         self._tables.append(rows[keep])
         self._times.append(time_ns[keep])
+
+
+# Writing.
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some lines of a table: their times (n,), and what else is in them by
+    name, (n,) each: arrays of floats, or cells as they stood in the table that
+    was read."""
+
+    time_ns: tc.Ints
+    columns: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, block: td.SampleBlock) -> Rows:
+        outputs = dict(zip(("ux", "uy", "uz"), block.readings.T, strict=True))
+        return cls(block.time_ns, outputs | dict(block.channels))
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+def write_csv(out: TextIO, blocks: Iterable[Rows], start_ns: int | None = None) -> int:
+    """Header ``t_s,ux,uy,uz`` and the other columns', one line a sample; the
+    number of samples.
+
+    Times count from ``start_ns``, the first sample where that is None, to the
+    nanosecond; values are the shortest text that reads back as the same number.
+    Raises RecordingError where a block has other columns than the first.
+    """
+    samples = 0
+    names: Sequence[str] | None = None
+    for block in blocks:
+        if names is None:
+            out.write(_line(["t_s", *block.columns]))
+        names = require_alike(block, names, samples)
+        if not len(block):
+            continue
+        start_ns = int(block.time_ns[0]) if start_ns is None else start_ns
+        out.writelines(_lines(block, start_ns))
+        samples += len(block)
+    if names is None:
+        out.write("t_s,ux,uy,uz\n")
+    return samples
+
+
+def require_alike(block: Rows, names: Sequence[str] | None, samples: int) -> Sequence[str]:
+    """The names of its columns, which are those of the blocks before. Raises
+    RecordingError."""
+    if names is not None and list(block.columns) != names:
+        raise RecordingError(f"channels {list(block.columns)[3:]} after sample {samples}, expected {list(names)[3:]}")
+    return list(block.columns)
+
+
+def _lines(block: Rows, start_ns: int) -> Iterable[str]:
+    columns = [_texts(values) for values in block.columns.values()]
+    for time_ns, *values in zip((block.time_ns - start_ns).tolist(), *columns, strict=True):
+        sign = "-" if time_ns < 0 else ""
+        seconds, ns = divmod(abs(time_ns), 1_000_000_000)
+        yield f"{sign}{seconds}.{ns:09d},{','.join(values)}\n"
+
+
+def _texts(values: Any) -> Iterable[str]:
+    if isinstance(values, np.ndarray):
+        return map(repr, values.tolist())
+    return ("" if cell is None else _quoted(str(cell)) for cell in values.to_pylist())
+
+
+def _quoted(cell: str) -> str:
+    return _line([cell])[:-1] if set(cell) & set(',"\r\n') else cell
+
+
+def _line(cells: Sequence[str]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(cells)
+    return out.getvalue()

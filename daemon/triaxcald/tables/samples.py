@@ -32,8 +32,17 @@ from triaxcald.tables.naming import (
     roles_of,
     seconds_and_rest,
 )
-from triaxcald.tables.native_csv import REQUIRED, CsvSamples, header_of, is_applied, is_native, samples_of_blocks
-from triaxcald.tables.source import blocks, label_of, whole_lines
+from triaxcald.tables.native_csv import (
+    REQUIRED,
+    CsvSamples,
+    blocks,
+    header_of,
+    is_applied,
+    is_native,
+    label_of,
+    samples_of_blocks,
+    whole_lines,
+)
 
 # Which column of a table is the time, in which unit, or by which rate its samples
 # are counted.

@@ -7,21 +7,18 @@ from typing import TYPE_CHECKING
 from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
-    from triaxcal_drivers.can.description import object_dictionary, stream_layout
-    from triaxcal_drivers.can.layout import NODES, Layout, Message
+    from triaxcal_drivers.can.layout import NODES, Layout, Message, object_dictionary, stream_layout
     from triaxcal_drivers.can.line import BusListener, opened
     from triaxcal_drivers.can.model import BusSettings, CanBus, CanProfile, object_address
     from triaxcal_drivers.can.python_can import open_python_can
 
 _NAMES = {
-    "description": (
-        "object_dictionary",
-        "stream_layout",
-    ),
     "layout": (
         "Layout",
         "Message",
         "NODES",
+        "object_dictionary",
+        "stream_layout",
     ),
     "line": (
         "BusListener",

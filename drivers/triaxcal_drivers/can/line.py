@@ -22,8 +22,7 @@ from importlib.util import find_spec
 from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
-from triaxcal_drivers.can.adapter import Adapter, Frame, Identifier
-from triaxcal_drivers.can.error_frame import ErrorClass, error_frame
+from triaxcal_drivers.can.adapter import Adapter, ErrorClass, Frame, Identifier, error_frame
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.host_clock import HOST

@@ -22,9 +22,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from triaxcal_drivers.can import error_frame
-from triaxcal_drivers.can.adapter import Frame, Identifier
-from triaxcal_drivers.can.error_frame import ControllerState
+from triaxcal_drivers.can.adapter import BUS_OFF, ControllerState, Frame, Identifier
 from triaxcal_drivers.can.model import SocketCanOptions
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.hints import nearest
@@ -470,7 +468,7 @@ class SocketCan:
                 self._failure = reason(e, self._name)
                 continue
             frame = frame_of(raw, ancillary, flags)
-            if frame.flags & _ERROR and frame.source & error_frame.BUS_OFF:
+            if frame.flags & _ERROR and frame.source & BUS_OFF:
                 self._bus_off = True
             frames.append(frame)
         return frames

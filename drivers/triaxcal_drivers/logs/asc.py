@@ -1,7 +1,7 @@
 """Vector's ASC: text, a line for each event.
 
-Ours, and not python-can's: that one ends with the first damaged line, adds no
-relative times up, and knows no symbolic names.
+python-can's reader is not used: it ends at the first damaged line, adds up no
+relative times, and has no symbolic names.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _IDENTIFIER = re.compile(rb"([0-9A-Fa-f]+)(x?)$", re.I)
 _DECLARED = re.compile(rb"\bID\s*=\s*(\d{1,10})(x?)", re.I)
 _PASSED_OVER = re.compile(
     rb"(?://|;|date\b|base\b|(?:no\s+)?internal\s+events|begin\b|end\b|previous\s+log)", re.I
-)  # the head of a file, and what stands between events
+)  # head of a file, and lines between events
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
@@ -68,27 +68,27 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
 
 @dataclass
 class _Reader:
-    """**Time.** Absolute times are since the start, relative ones since the
-    event before. The start is the last date before the first event: that of
-    the head, or the trigger block's.
+    """**Time.** Absolute times count from the start, relative times from the previous
+    event. The start is the last date before the first event: that of the head, or
+    that of the trigger block.
 
-    The date of a later block says when that block begins. The block's times
-    may count from there (a measurement that was started again), or go on from
-    before (one that was not): its first event tells, which lies near the date
-    and does not go back. Going back counts twice: dates are often in whole
-    seconds, and are local time.
+    The date of a later block is the time at which that block begins. The block's
+    times count from that date if the measurement was started again; else they
+    continue. The block's first event tells which: the correct time is near the date
+    and does not go back. Going back counts twice, as dates are often in whole
+    seconds and in local time.
     """
 
     account: Account
     base: int = 16
     relative: bool = False
-    begun: bool = False  # with the first event
+    begun: bool = False  # whether the first event has come
     start_ns: int = 0
     now_ns: int = 0
-    date_ns: int | None = None  # that no event has followed yet
+    date_ns: int | None = None  # date without an event after it
 
     def head(self, line: bytes) -> bool:
-        """Whether the line is one that may stand where no event does."""
+        """Reads a line that is no event; whether the format allows it."""
         if base := _BASE.match(line):
             self.base = 16 if base[1].lower() == b"hex" else 10
             self.relative = (base[2] or b"").lower() == b"relative"
@@ -116,17 +116,18 @@ class _Reader:
             self.account.other("event")
         return None
 
-    def _advance(self, told_ns: int) -> None:
-        """To the next event."""
-        now_ns = (self.now_ns if self.relative else self.start_ns) + told_ns
+    def _advance(self, written_ns: int) -> None:
+        """Sets the time of the next event."""
+        now_ns = (self.now_ns if self.relative else self.start_ns) + written_ns
         date_ns, self.date_ns = self.date_ns, None
+        # After a date, choose between a new start and the old one.
         if date_ns is not None:
-            anew_ns = date_ns + told_ns
-            if not self.begun or self._strange(anew_ns, date_ns) < self._strange(now_ns, date_ns):
-                self.start_ns, now_ns = date_ns, anew_ns
+            restarted_ns = date_ns + written_ns
+            if not self.begun or self._implausibility(restarted_ns, date_ns) < self._implausibility(now_ns, date_ns):
+                self.start_ns, now_ns = date_ns, restarted_ns
         self.begun, self.now_ns = True, now_ns
 
-    def _strange(self, time_ns: int, date_ns: int) -> int:
+    def _implausibility(self, time_ns: int, date_ns: int) -> int:
         return abs(time_ns - date_ns) + 2 * max(0, self.now_ns - time_ns)
 
     def _classic(self, m: re.Match[bytes], where: str) -> LoggedFrame | None:
@@ -171,8 +172,8 @@ class _Reader:
         return LoggedFrame(self.now_ns, source, flags, data, channel.decode())
 
     def _identifier(self, name: bytes, rest: bytes) -> tuple[int, int] | None:
-        """Identifier and flag of a name: digits, or a symbolic one with
-        ``ID = …`` behind the data."""
+        """Identifier and flag by digits, or by a symbolic name with ``ID = …`` after
+        the data."""
         m = _IDENTIFIER.match(name)
         declared = _DECLARED.search(rest)
         if declared is not None and (m is None or len(m[1]) > 8):
@@ -185,7 +186,7 @@ class _Reader:
         words = text.split(None, count)[:count]
         try:
             if count:
-                whole(b"".join(words), self.base)  # digits alone, as each word has to be
+                whole(b"".join(words), self.base)  # each word must be of digits alone
             return bytes(int(word, self.base) for word in words) if len(words) == count else None
         except ValueError:
             return None

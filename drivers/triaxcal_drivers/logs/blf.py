@@ -1,8 +1,8 @@
 """Vector's BLF: objects, most of them in compressed containers.
 
-Ours, and not python-can's: that one unpacks a container however large it
-becomes, ends with the first damaged object, says nowhere where, and rounds
-times to a quarter of a microsecond.
+python-can's reader is not used: it unpacks a container of any size, ends at the first
+damaged object without telling its place, and rounds times to a quarter of a
+microsecond.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from triaxcal_drivers.logs.can_frames import (
 
 MAGIC = b"LOGG"
 OBJECT_MOST = 16 * 2**20
-"""Bytes of an object, a container among them, packed or not. Containers of 128
-KiB are usual."""
-EXPANSION_MOST = 64  # so many times a file may unpack to; ours come to three to ten times
+"""Most bytes of an object or a container, compressed or not. Usual containers have 128
+KiB."""
+EXPANSION_MOST = 64  # times its size, to which a file may unpack; usual files reach three to ten times
 
 _FILE = struct.Struct("<4sI32x8H")  # signature, bytes of the header, start
 _OBJECT = struct.Struct("<4sHHII")  # signature, bytes of the header, its version, bytes of the object, type
@@ -51,8 +51,8 @@ _CONTAINER_TYPE = 10
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
-    """Of an opened file from its start. Raises nothing for what the file
-    holds."""
+    """All frames from the start of an opened file. Damage raises no error; it is
+    counted in the account."""
     head = stream.read(_FILE.size)
     if len(head) < _FILE.size:
         account.note("byte 0", "the file ends in its header")
@@ -62,6 +62,7 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
     stream.read(max(0, min(header_bytes, 4096) - _FILE.size))
     read = max(header_bytes, _FILE.size)
     unpacked = 0
+    # Read one object after the other; most are containers of objects.
     while base := stream.read(_OBJECT.size):
         where = f"byte {read}"
         length = _OBJECT.unpack(base)[3] if len(base) == _OBJECT.size else 0
@@ -94,7 +95,7 @@ def _start_ns(system_time: list[int], account: Account) -> int:
 
 
 def _unpacked(body: bytes, where: str, account: Account) -> bytes:
-    """What is whole of a container."""
+    """The readable part of a container."""
     if len(body) < _CONTAINER.size:
         return b""
     method, size = _CONTAINER.unpack_from(body)
@@ -112,8 +113,8 @@ def _unpacked(body: bytes, where: str, account: Account) -> bytes:
 
 
 class _Objects:
-    """The objects in a row of containers; one may begin in one and end in the
-    next."""
+    """Objects in a row of containers. An object may begin in one container and end in
+    the next."""
 
     def __init__(self, start_ns: int, account: Account) -> None:
         self._start_ns, self._account = start_ns, account
@@ -123,7 +124,7 @@ class _Objects:
         data = self._rest + data
         at = 0
         while True:
-            found = data.find(b"LOBJ", at, at + 8)  # padding lies between objects
+            found = data.find(b"LOBJ", at, at + 8)  # between objects there is padding
             if found < 0 and at + 8 <= len(data):
                 found = data.find(b"LOBJ", at)
                 self._account.note(where, "bytes in a container that are no object")
@@ -164,17 +165,17 @@ class _Objects:
         return LoggedFrame(time_ns, *made)
 
 
-_Made = tuple[int, int, bytes, str]
+_FrameFields = tuple[int, int, bytes, str]
 
 
-def _classic(data: bytes, at: int) -> _Made:
+def _classic(data: bytes, at: int) -> _FrameFields:
     channel, bits, dlc, identifier, octets = _CLASSIC.unpack_from(data, at)
     flags = (SENT if bits & 1 else 0) | (REMOTE if bits & 0x80 else 0)
     length = min(dlc, CLASSIC_MOST)
     return *_source(identifier, flags), bytes(length) if flags & REMOTE else octets[:length], str(channel)
 
 
-def _fd(data: bytes, at: int) -> _Made:
+def _fd(data: bytes, at: int) -> _FrameFields:
     channel, bits, dlc, identifier, _, _, fd_bits, valid, octets = _FD.unpack_from(data, at)
     flags = (SENT if bits & 1 else 0) | (REMOTE if bits & 0x80 else 0)
     if fd_bits & 1:
@@ -182,7 +183,7 @@ def _fd(data: bytes, at: int) -> _Made:
     return *_source(identifier, flags), octets[: min(valid, FD_LENGTHS[dlc & 15])], str(channel)
 
 
-def _fd_64(data: bytes, at: int) -> _Made:
+def _fd_64(data: bytes, at: int) -> _FrameFields:
     channel, dlc, valid, identifier, bits, _, sent, data_end = _FD_64.unpack_from(data, at)
     flags = SENT if sent else 0
     if bits & 0x1000:
@@ -191,15 +192,15 @@ def _fd_64(data: bytes, at: int) -> _Made:
         flags |= REMOTE
     length = min(valid, FD_LENGTHS[dlc & 15], FD_MOST)
     end = min(data_end or len(data), len(data))
-    octets = data[at + _FD_64.size : end][:length].ljust(length, b"\0")  # as CANoe fills up what is cut off
+    octets = data[at + _FD_64.size : end][:length].ljust(length, b"\0")  # CANoe omits zeros at the end
     return *_source(identifier, flags), octets, str(channel)
 
 
-def _error(data: bytes, at: int) -> _Made:
+def _error(data: bytes, at: int) -> _FrameFields:
     return 0, ERROR, b"", str(_ERROR.unpack_from(data, at)[0])
 
 
-def _error_64(data: bytes, at: int) -> _Made:
+def _error_64(data: bytes, at: int) -> _FrameFields:
     return 0, ERROR, b"", str(_ERROR_64.unpack_from(data, at)[0])
 
 

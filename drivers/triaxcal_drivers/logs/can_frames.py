@@ -1,6 +1,5 @@
-"""What a reader of a log gives: frames, which of them have a moment, and an
-account of what was in the log besides; the lines of a log that is text, and the
-dates in them."""
+"""Results of the log readers: frames, and an account of the other contents of a log.
+Also the lines of text logs and the dates in them."""
 
 from __future__ import annotations
 
@@ -26,19 +25,18 @@ EXTENDED, REMOTE, ERROR, FD, SWITCHED, SENT = (
         RawFlag.SENT,
     )
 )
-"""Whole numbers: a reader joins them for every frame."""
+"""Integers, as a reader combines flags for every frame."""
 STANDARD_MOST, EXTENDED_MOST = 0x7FF, 0x1FFFFFFF
 CLASSIC_MOST, FD_MOST = 8, 64  # bytes of a frame
-OTHERS_MOST = 64  # kinds of records that are counted apart; ours have a handful
+OTHERS_MOST = 64  # kinds of other records that are counted separately; usual logs have a handful
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-"""Bytes by the data length code (ISO 11898-1)."""
+"""Number of bytes by the data length code (ISO 11898-1)."""
 
 
 class LoggedFrame(NamedTuple):
-    """A frame as a log has it. ``time_ns`` is since the epoch, or since the
-    log's own start where it has no date; None where the log tells no times.
-    ``source``, ``flags`` and ``data`` are as in `Frame`; ``channel`` is what
-    the log calls the bus."""
+    """A frame of a log. ``time_ns`` counts from the epoch, or from the start of a log
+    without a date; None in a log without times. ``source``, ``flags`` and ``data``
+    are as in `Frame`. ``channel`` is the log's name of the bus."""
 
     time_ns: int | None
     source: int
@@ -48,20 +46,19 @@ class LoggedFrame(NamedTuple):
 
 
 class Remark(StrEnum):
-    """What a reader of the recording ought to know."""
+    """A property of the log that a user of the recording should know."""
 
     NO_TIMES = auto()
-    NO_DATE = auto()  # times count from the log's own start
-    DATE_WITHOUT_ZONE = auto()  # taken for UTC
-    TIMES_ADDED_UP = auto()  # each is since the line before
+    NO_DATE = auto()  # times count from the start of the log
+    DATE_WITHOUT_ZONE = auto()  # interpreted as UTC
+    TIMES_ADDED_UP = auto()  # each counts from the previous line
 
 
 @dataclass
 class Account:
-    """What was met besides frames. ``damaged`` counts places that hold no
-    record of the kind, ``damage`` says where the first is and what was
-    expected; ``others`` counts records of which no frame is made, by their
-    kind."""
+    """Contents of a log other than frames. ``damaged`` counts places without a valid
+    record; ``damage`` tells the first of them and the expected record. ``others``
+    counts records that make no frame, by their kind."""
 
     damaged: int = 0
     damage: str = ""
@@ -69,29 +66,28 @@ class Account:
     remarks: set[Remark] = field(default_factory=set)
 
     def other(self, what: str, count: int = 1) -> None:
-        """A record of which no frame is made."""
+        """Counts a record that makes no frame."""
         self.others[what if what in self.others or len(self.others) < OTHERS_MOST else "further kinds"] += count
 
     def note(self, where: str, what: str) -> None:
-        """A damaged place."""
+        """Counts a damaged place."""
         self.damaged += 1
         self.damage = self.damage or f"{where}: {what}"
 
 
 LONGEST_NS = 2**62
-"""A hundred and forty-six years, since the epoch or between two times: what is
-longer is damage."""
+"""A hundred and forty-six years. A longer time, since the epoch or between two times,
+is damage."""
 UNTIMED_MOST = 100_000
-"""Frames without a time that are held back until one has a time, some tens of
-MB."""
+"""Most frames without a time that wait for one with a time, some tens of MB."""
 
 Placed = tuple[str, LoggedFrame | str]
-"""A place in a log, and the frame there or what is wrong with it."""
+"""A place in a log, and its frame or the description of its damage."""
 
 
 def utc_ns(year: int, month: int, day: int, hour: int, minute: int, second: int) -> int | None:
-    """Nanoseconds since the epoch; None where the calendar has no such moment,
-    and for one before the epoch or beyond `LONGEST_NS`."""
+    """Nanoseconds since the epoch; None if the calendar has no such moment, or if it is
+    before the epoch or beyond `LONGEST_NS`."""
     try:
         seconds = int(datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp())
     except ValueError:
@@ -100,18 +96,20 @@ def utc_ns(year: int, month: int, day: int, hour: int, minute: int, second: int)
 
 
 def timed(found: Iterator[Placed], account: Account) -> Iterator[LoggedFrame]:
-    """The frames that have a time; one that has none is damage, wherever it
-    stands. Only where no frame has a time (none of the first `UNTIMED_MOST`) it
-    is a log without times: then all are given without, and that is remarked
-    before the first."""
+    """Frames with a time. A frame without one is damage, unless none of the first
+    `UNTIMED_MOST` frames has a time: then the log has no times, every frame comes
+    without one, and the account has that remark before the first frame."""
+    # Wait for the first frame with a time.
     first: list[Placed] = []
     for placed in found:
         first.append(placed)
         if _has_time(placed) or len(first) == UNTIMED_MOST:
             break
+    # No such frame: the log has no times.
     without = any(isinstance(frame, LoggedFrame) for _, frame in first) and not any(map(_has_time, first[-1:]))
     if without:
         account.remarks.add(Remark.NO_TIMES)
+    # Pass on all frames, with or without times.
     for where, frame in chain(first, found):
         if isinstance(frame, str):
             account.note(where, frame)
@@ -128,7 +126,7 @@ def _has_time(placed: Placed) -> bool:
     return isinstance(frame, LoggedFrame) and frame.time_ns is not None
 
 
-BLOCK = 2**16  # bytes that are read at once
+BLOCK = 2**16  # bytes of one read
 LINE_MOST = 4096  # bytes; a CAN FD frame of Vector's has some 400
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8, which editors of Windows put before the first line
 
@@ -146,9 +144,9 @@ _DATE = re.compile(
 
 
 def numbered(stream: BinaryIO, account: Account) -> Iterator[tuple[int, bytes]]:
-    """Each line that is not empty with its number from 1, without blanks at its
-    ends and a byte order mark. One that is too long is damage, and a last one
-    without its end: nobody can tell what is missing from it."""
+    """Each line that is not empty, with its number from 1, without outer blanks and
+    byte order mark. A line that is too long is damage. So is a last line without its
+    end, as its missing part is unknown."""
     number, rest, overlong = 0, b"", False
     while block := stream.read(BLOCK):
         lines = (rest + block).split(b"\n")
@@ -169,21 +167,21 @@ def numbered(stream: BinaryIO, account: Account) -> Iterator[tuple[int, bytes]]:
 
 
 def whole(text: str | bytes, base: int = 10) -> int:
-    """Of digits alone: int() also takes signs, blanks, ``0x`` and underlines.
-    Raises ValueError."""
+    """The integer of digits alone; int() also accepts signs, blanks, ``0x`` and
+    underscores. Raises ValueError."""
     if not text.isalnum() or not text.isascii() or text[1:2] in ("x", "X", b"x", b"X"):
         raise ValueError("no whole number")
     return int(text, base)
 
 
 def nanoseconds(seconds: bytes, fraction: bytes) -> int:
-    """Of a decimal number's two parts."""
+    """Nanoseconds by the two parts of a decimal number of seconds."""
     return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, b"0") or 0)
 
 
 def date_ns(text: str) -> int | None:
-    """Nanoseconds since the epoch of "Wed Nov 25 04:38:43.125 pm 2026", taken
-    for UTC; None where it is no such date."""
+    """Nanoseconds since the epoch of a date like "Wed Nov 25 04:38:43.125 pm 2026",
+    interpreted as UTC; None for another text."""
     match = _DATE.search(text)
     month = _MONTHS.get(match[1].lower()) if match else None
     if match is None or month is None:

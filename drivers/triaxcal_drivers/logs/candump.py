@@ -1,7 +1,7 @@
-"""What can-utils' candump writes: the log of ``-l`` and ``-L``, and what it
-shows, with times or without.
+"""Output of candump (can-utils): the log of ``-l`` and ``-L``, and the text on the
+terminal, with or without times.
 
-python-can reads the log alone, and ends with the first damaged line.
+python-can reads only the log, and ends at the first damaged line.
 """
 
 from __future__ import annotations
@@ -43,28 +43,28 @@ SHOWN = re.compile(
 )
 _DAY = re.compile(rb"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):$")
 _ERROR_BIT = 0x20000000
-_BRS, _ESI = 1, 2  # bits of the digit behind ##
-EPOCH_FROM_NS = 10**17  # a time since the epoch is later, in 1973, and one since the start is earlier
-LOOKED_AT = 1000  # lines by which times since the start are told from times since the line before
+_BRS, _ESI = 1, 2  # bits of the digit after ##
+EPOCH_FROM_NS = 10**17  # in 1973: times since the epoch are later, times since the start earlier
+LOOKED_AT = 1000  # lines that tell times since the start from times since the previous line
 NEAR, NEAR_LEAST = 8, 16
-"""Lines are compared with those that lie nearer than an eighth of those looked
-at: so few of the pairs have a new start between them, where several logs were
-joined. Of a short log all are compared."""
-RISING = 0.75  # of the pairs: midway between those of times since the line before, and of times since the start
+"""A line is compared with lines nearer than an eighth of all lines looked at, so that
+few pairs have a new start between them where several logs were joined. In a short
+log all pairs are compared."""
+RISING = 0.75  # share of rising pairs, midway between those of the two kinds of times
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
-    """**Time.** Since the epoch, since the start (``-t z``) or since the line
-    before (``-t d``). What is since the start rises from nearly every line to
-    the next ones, however much a few go back; what is since the line before
-    has no trend: of two lines either is as often the larger, or they are
+    """**Time.** Times count from the epoch, from the start (``-t z``) or from the
+    previous line (``-t d``). Times from the start rise from nearly every line to the
+    following ones, even if a few go back. Times from the previous line have no
+    trend: of two lines, either has the larger one equally often, or they are
     equal."""
     found = timed(_frames(stream, account), account)
     head = list(islice(found, LOOKED_AT))
     times = [f.time_ns for f in head if f.time_ns is not None]
     if times and sorted(times)[len(times) // 2] < EPOCH_FROM_NS:
         account.remarks.add(Remark.NO_DATE)
-        if not _rise(times[1:]):  # the first is zero in either
+        if not _rise(times[1:]):  # the first is zero in both cases
             account.remarks.add(Remark.TIMES_ADDED_UP)
             yield from _added_up(chain(head, found))
             return
@@ -73,7 +73,7 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
 
 
 def _rise(times: list[int]) -> bool:
-    """True of fewer than two."""
+    """Whether the times rise; True for fewer than two."""
     score = pairs = 0  # a pair that rises counts two, one of equals one
     for apart in range(1, max(len(times) // NEAR, NEAR_LEAST)):
         score += sum((b > a) + (b >= a) for a, b in zip(times, times[apart:], strict=False))
@@ -131,7 +131,7 @@ def _shown(m: _Match, account: Account) -> LoggedFrame | None:
 
 
 def _time_ns(day: bytes, seconds: bytes, fraction: bytes, account: Account) -> int | None:
-    """None where the date is none."""
+    """Time [ns]; None if the date is invalid."""
     time_ns = nanoseconds(seconds, fraction)
     if not day.strip():
         return time_ns

@@ -1,4 +1,4 @@
-"""Which kind of log a file is, by its first bytes, and its frames."""
+"""Kinds of log files, told by their first bytes, and the frames in a log."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from triaxcal_drivers.files import open_file, special_kind
 from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
 from triaxcal_drivers.logs.can_frames import BYTE_ORDER_MARK, Account, LoggedFrame
 
-HEAD = 8192  # bytes by which the kind is told
+HEAD = 8192  # bytes that tell the kind
 GZIP = b"\x1f\x8b"
 MCAP = b"\x89MCAP0\r\n"
 EXPANSION_MOST, ROOM = 64, 2**20
-"""So many times its size, and so many bytes more, a packed file may unpack
-to."""
-LINES_LOOKED_AT = 20  # of a text, for one that tells its kind
+"""A compressed file may unpack to `EXPANSION_MOST` times its size plus `ROOM` bytes."""
+LINES_LOOKED_AT = 20  # of a text, in search of one that tells its kind
 
 
 @dataclass(frozen=True)
 class Kind:
-    """``name`` for messages. ``seeks`` where the reader does not go through the
-    file from its start to its end."""
+    """``name`` is for messages. ``seeks``: the reader does not read the file from start
+    to end."""
 
     name: str
     frames: Callable[[BinaryIO, Account], Iterator[LoggedFrame]]
@@ -49,8 +48,8 @@ NAMES = "BLF, ASC, candump, TRC, MF4, pcap, pcapng or MCAP"
 
 
 def kind_of(head: bytes) -> Kind | str | None:
-    """By a file's first bytes; `MCAP_KIND` for a file that holds no frames of a
-    bus, but messages."""
+    """Kind of a file by its first bytes; `MCAP_KIND` for a file of messages instead of
+    bus frames."""
     if head.startswith(blf.MAGIC):
         return BLF
     if head.startswith(mf4.MAGICS):
@@ -65,7 +64,7 @@ def kind_of(head: bytes) -> Kind | str | None:
 def _of_text(head: bytes) -> Kind | None:
     lines = [line.strip() for line in head.removeprefix(BYTE_ORDER_MARK).split(b"\n")[:LINES_LOOKED_AT] if line.strip()]
     if len(head) == HEAD and len(lines) > 1:
-        lines = lines[:-1]  # cut off
+        lines = lines[:-1]  # the last one may be incomplete
     if any(trc.HEAD.match(line) for line in lines):
         return TRC
     if any(asc.HEAD.match(line) for line in lines):
@@ -84,7 +83,7 @@ class Log:
     stream: BinaryIO
 
     def frames(self, account: Account) -> Iterator[LoggedFrame]:
-        """Raises LogError, in one line with the file's name."""
+        """All frames. Raises LogError, in one line with the file's name."""
         assert isinstance(self.kind, Kind)
         try:
             yield from self.kind.frames(self.stream, account)
@@ -98,13 +97,14 @@ class Log:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Log]:
-    """Packed with gzip or not. Raises LogError."""
+    """Opens a log, compressed with gzip or not. Raises LogError."""
     try:
         file = open_file(path)
     except OSError as e:
         raise LogError(f"{path}: cannot be read: {e.strerror}") from e
     with file:
         stream = file
+        # Uncompress and tell the kind.
         try:
             if _head(file, len(GZIP)) == GZIP:
                 stream = cast(BinaryIO, _unpacked(file, path))
@@ -113,10 +113,11 @@ def opened(path: Path) -> Iterator[Log]:
             raise LogError(f"{path}: cannot be read: {_reason(e)}") from e
         kind = kind_of(head)
         if kind is None:
-            told = "; the file is empty" if not head else ""
+            hint = "; the file is empty" if not head else ""
             if known := special_kind(head):
-                told = f"; the file is {known}"
-            raise LogError(f"{path}: no log of a known kind, expected {NAMES}{told}")
+                hint = f"; the file is {known}"
+            raise LogError(f"{path}: no log of a known kind, expected {NAMES}{hint}")
+        # A reader that seeks needs an uncompressed copy.
         seeks = kind.seeks if isinstance(kind, Kind) else True
         if stream is not file and seeks:
             with tempfile.TemporaryFile() as whole:
@@ -135,7 +136,7 @@ def _reason(e: Exception) -> str:
 
 
 def _head(stream: BinaryIO, count: int) -> bytes:
-    """The first bytes, which stay unread."""
+    """The first bytes; the next read returns them again."""
     return cast(io.BufferedReader, stream).peek(count)[:count]
 
 
@@ -145,7 +146,7 @@ def _unpacked(file: BinaryIO, path: Path) -> io.BufferedReader:
 
 
 class _Bounded(io.RawIOBase):
-    """Raises OSError where a file unpacks to more than ``most`` bytes."""
+    """Reads a gzip file. Raises OSError if it unpacks to more than ``most`` bytes."""
 
     def __init__(self, source: gzip.GzipFile, most: int) -> None:
         self._source, self._left = source, most

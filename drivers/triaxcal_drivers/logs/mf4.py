@@ -1,7 +1,7 @@
 """ASAM MDF 4 with bus logging: the one file that imports asammdf.
 
-asammdf follows a file's links wherever they lead and makes room for what the
-file says there is. So the file's blocks are looked through before.
+asammdf follows the links in a file without a check and allocates memory by the sizes
+in it. This module therefore checks all blocks first.
 """
 
 from __future__ import annotations
@@ -41,27 +41,28 @@ from triaxcal_drivers.logs.can_frames import (
 MAGICS = (b"MDF     ", b"UnFinMF ")
 RECORDS_AT_ONCE = 8192
 BLOCKS_MOST, LINKS_MOST = 200_000, 100_000
-"""Of a file, and of one block; a logger's file has some thousand blocks."""
+"""Most blocks of a file, and links of a block; a logger's file has some thousand
+blocks."""
 EXPANSION_MOST, ROOM = 64, 16 * 2**20
-"""So many times its size, and so many bytes more, a file may unpack to."""
+"""A file may unpack to `EXPANSION_MOST` times its size plus `ROOM` bytes."""
 
 _BLOCK = struct.Struct("<4s4xQQ")  # kind, bytes, links
 _ZIPPED = struct.Struct("<2sBxIQQ")  # kind, method, parameter, bytes unpacked, bytes
 _GROUP = struct.Struct("<QQHH4xII")  # record id, records, flags, separator, bytes of a record, of its invalidation
 _HEADER_AT = 64
 _CHAINED = frozenset((b"##DG", b"##CG", b"##CN", b"##DL", b"##FH", b"##CH", b"##AT", b"##EV", b"##LD"))
-"""Blocks whose first link leads to the next of a chain; that of a channel also
-has its parts in the second."""
+"""Blocks whose first link leads to the next block of a chain. The second link of a
+channel leads to its parts."""
 _VARIABLE_LENGTH = 1  # flag of a group
-_LOCAL_TIME = 1  # flag of the time in the header: of no known zone
+_LOCAL_TIME = 1  # flag of the time in the header: its zone is unknown
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
     """Raises LogError; ModuleNotFoundError without asammdf."""
-    finished = look_through(stream)
+    finished = check_blocks(stream)
     stream.seek(0)
     with ExitStack() as stack:
-        if not finished:  # asammdf finishes it, in the file
+        if not finished:  # asammdf finishes the file itself, so it gets a copy
             copy = stack.enter_context(tempfile.TemporaryFile())
             shutil.copyfileobj(stream, copy)
             copy.seek(0)
@@ -75,22 +76,22 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
             yield from _in_order([_Group(mdf, number, start_ns, name) for number, name in _bus_groups(mdf, account)])
         except LogError:
             raise
-        except Exception as e:  # whatever asammdf stumbles over
+        except Exception as e:  # asammdf has no common error class
             raise LogError(f"not an MF4 file that can be read: {_one_line(e)}") from e
 
 
 def _opened(stream: BinaryIO) -> Any:
-    """asammdf's MDF. What it began and did not finish cannot be closed, and
-    says so when it is collected: that is not shown."""
-    if sys.modules.get("asammdf", sys) is None:  # kept from python-can by the command line
+    """Opens asammdf's MDF. An instance whose constructor failed cannot be closed and
+    prints an error when it is collected; that output is suppressed."""
+    if sys.modules.get("asammdf", sys) is None:  # the command line hides it from python-can
         del sys.modules["asammdf"]
     from asammdf import MDF  # a second, and only an MF4 needs it
 
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # what it logs comes back as exceptions too
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its log entries repeat exceptions
     shown, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
         return MDF(cast(Any, stream))
-    except Exception as e:  # noqa: BLE001 - whatever asammdf stumbles over
+    except Exception as e:  # noqa: BLE001 - asammdf has no common error class
         why = _one_line(e)
         traceback.clear_frames(e.__traceback__)
         gc.collect()
@@ -104,7 +105,7 @@ def _one_line(e: Exception) -> str:
 
 
 def _bus_groups(mdf: Any, account: Account) -> Iterator[tuple[int, str]]:
-    """The groups that hold frames, with the name of their channel."""
+    """Numbers of the groups with frames, and the name of their channel."""
     for number, group in enumerate(mdf.groups):
         if not group.channel_group.cycles_nr:
             continue
@@ -118,7 +119,7 @@ def _bus_groups(mdf: Any, account: Account) -> Iterator[tuple[int, str]]:
 
 @dataclass
 class _Block:
-    """Frames of a group, in its order, from ``at`` on."""
+    """Frames of a group in its order; those from ``at`` on are left."""
 
     time_ns: NDArray[np.int64]
     frames: list[LoggedFrame]
@@ -161,20 +162,20 @@ class _Group:
 
 
 def _times_ns(start_ns: int, seconds: NDArray[np.float64]) -> NDArray[np.int64]:
-    """-1, which is no time, for what is no number or beyond all measure."""
-    told = np.abs(seconds) < LONGEST_NS / 1e9
-    return np.where(told, start_ns + np.rint(np.where(told, seconds, 0) * 1e9).astype(np.int64), -1)
+    """Times [ns]; -1, which is no time, for a value that is no number or too large."""
+    valid = np.abs(seconds) < LONGEST_NS / 1e9
+    return np.where(valid, start_ns + np.rint(np.where(valid, seconds, 0) * 1e9).astype(np.int64), -1)
 
 
 class _Columns:
-    """Parts of a group's frames, by their names behind the point."""
+    """Columns of a group's frames, by the part of their names after the point."""
 
     def __init__(self, samples: Any, name: str) -> None:
         self._samples, self._name = samples, name
         self._named = set(samples.dtype.names or ())
 
     def whole(self, part: str) -> NDArray[Any]:
-        """Nothing but zeros where there is no such part."""
+        """An integer column; zeros if the group has none of that name."""
         if f"{self._name}.{part}" not in self._named:
             return np.zeros(len(self._samples), dtype=np.int64)
         return np.asarray(self._samples[f"{self._name}.{part}"]).astype(np.int64)
@@ -207,12 +208,14 @@ class _Columns:
 
 
 def _in_order(groups: Sequence[_Group]) -> Iterator[LoggedFrame]:
-    """The groups' frames as one row in order of time, each group's in its own
-    order, with one block of each in memory."""
+    """All frames in order of time, with one block of each group in memory. Frames of a
+    group keep their order."""
+    # One block of each group.
     waiting: list[tuple[Iterator[list[LoggedFrame]], _Block]] = []
     for group in groups:
         _next_block(group.blocks(), waiting)
     while waiting:
+        # Up to the earliest end of a block, no later block can have an earlier frame.
         until = min(int(block.time_ns[-1]) for _, block in waiting)
         ready: list[tuple[int, LoggedFrame]] = []
         left: list[tuple[Iterator[list[LoggedFrame]], _Block]] = []
@@ -221,6 +224,7 @@ def _in_order(groups: Sequence[_Group]) -> Iterator[LoggedFrame]:
             end = len(block.frames) if last else int(np.searchsorted(block.time_ns, until, side="right"))
             ready += zip(block.time_ns[block.at : end].tolist(), block.frames[block.at : end], strict=True)
             block.at = max(end, block.at)
+            # Replace a finished block by the next one of its group.
             if block.at < len(block.frames):
                 left.append((blocks, block))
             else:
@@ -231,36 +235,37 @@ def _in_order(groups: Sequence[_Group]) -> Iterator[LoggedFrame]:
 
 
 def _next_block(blocks: Iterator[list[LoggedFrame]], waiting: list[tuple[Iterator[list[LoggedFrame]], _Block]]) -> None:
-    """Times that go back within a group stay with the latest one before, as far
-    as its place among other groups goes."""
+    """Adds the next block of a group. Among the groups, a frame whose time goes back is
+    ordered by the latest time before it."""
     frames = next(blocks, [])
     if frames:
         times = np.array([f.time_ns for f in frames], dtype=np.int64)
         waiting.append((blocks, _Block(np.maximum.accumulate(times), frames)))
 
 
-def look_through(stream: BinaryIO) -> bool:
-    """All blocks that can be reached from the header; whether the file was
-    finished by its writer. Raises LogError, with the place, where the blocks
-    are not what a file of this size can hold."""
+def check_blocks(stream: BinaryIO) -> bool:
+    """Checks all blocks that the header leads to. Returns whether the writer finished
+    the file. Raises LogError, with the place, if a file of this size cannot have
+    such blocks."""
     size = stream.seek(0, 2)
     stream.seek(0)
     version = stream.read(_HEADER_AT)
     if len(version) < _HEADER_AT or int.from_bytes(version[28:30], "little") < 400:
         raise LogError("MDF before version 4, expected MDF 4 (.mf4)")
     finished = version[:8] == MAGICS[0]
-    _Survey(stream, size, finished=finished).walk()
+    _BlockCheck(stream, size, finished=finished).walk()
     return finished
 
 
-class _Survey:
+class _BlockCheck:
     def __init__(self, stream: BinaryIO, size: int, *, finished: bool) -> None:
         self._stream, self._size, self._finished = stream, size, finished
         self._unpacked = 0
-        self._records: list[tuple[int, int]] = []  # place of a group, bytes that it has
+        self._records: list[tuple[int, int]] = []  # offset of a group, size of its records
         self._next: dict[int, list[int]] = {}
 
     def walk(self) -> None:
+        # Visit every block once.
         todo, seen = [_HEADER_AT], {_HEADER_AT}
         while todo:
             at = todo.pop()
@@ -270,6 +275,7 @@ class _Survey:
                     todo.append(link)
             if len(seen) > BLOCKS_MOST:
                 raise LogError(f"more than {BLOCKS_MOST} blocks")
+        # Check the sizes of compressed blocks and of record groups.
         if self._unpacked > EXPANSION_MOST * self._size + ROOM:
             raise LogError(f"its blocks unpack to more than {EXPANSION_MOST} times the file")
         for at, needed in self._records:
@@ -290,13 +296,13 @@ class _Survey:
         if count > LINKS_MOST or (length and _BLOCK.size + 8 * count > length):
             raise LogError(f"byte {at}: a block of {length} bytes with {count} links")
         links = struct.unpack(f"<{count}Q", self._read(8 * count, at))
-        self._weigh(kind, length - _BLOCK.size - 8 * count, at)
+        self._add_size(kind, length - _BLOCK.size - 8 * count, at)
         if kind in _CHAINED:
             self._next[at] = [link for link in links[: 2 if kind == b"##CN" else 1] if link]
         return links
 
-    def _weigh(self, kind: bytes, held: int, at: int) -> None:
-        """What the block unpacks to, or says that there is."""
+    def _add_size(self, kind: bytes, held: int, at: int) -> None:
+        """Adds the size that the block unpacks to, or that its group claims."""
         if kind == b"##DZ":
             self._unpacked += _ZIPPED.unpack(self._read(_ZIPPED.size, at))[3]
         elif kind == b"##CG":
@@ -312,23 +318,25 @@ class _Survey:
         return data
 
     def _require_ends(self) -> None:
-        """No chain leads back into itself."""
-        came = dict.fromkeys(self._next, 0)
+        """Checks that no chain leads back to itself, by a topological sort."""
+        # Count the links to each block.
+        links_to = dict.fromkeys(self._next, 0)
         for links in self._next.values():
             for link in links:
-                if link in came:
-                    came[link] += 1
-        todo = [at for at, count in came.items() if not count]
+                if link in links_to:
+                    links_to[link] += 1
+        # Remove blocks without a link to them; those of a circle remain.
+        todo = [at for at, count in links_to.items() if not count]
         done = 0
         while todo:
             at = todo.pop()
             done += 1
             for link in self._next[at]:
-                if link in came:
-                    came[link] -= 1
-                    if not came[link]:
+                if link in links_to:
+                    links_to[link] -= 1
+                    if not links_to[link]:
                         todo.append(link)
-        if done < len(came):
+        if done < len(links_to):
             raise LogError(
-                f"byte {min(at for at, count in came.items() if count)}: blocks that lead back to themselves"
+                f"byte {min(at for at, count in links_to.items() if count)}: blocks that lead back to themselves"
             )

@@ -1,8 +1,8 @@
-"""pcap and pcapng of SocketCAN: frames as they are, or behind a header of
-Linux' cooked captures.
+"""pcap and pcapng of SocketCAN: frames alone, or after the header of a cooked capture
+of Linux.
 
-A parser of our own: libraries for pcap know little of CAN, and believe the
-lengths they read.
+Libraries for pcap are not used: they support little of CAN and trust the lengths in a
+file.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from triaxcal_drivers.logs.can_frames import (
     timed,
 )
 
-PACKET_MOST = 2**20  # bytes of a packet or a block; tcpdump keeps 256 KiB of one
+PACKET_MOST = 2**20  # bytes of a packet or a block; tcpdump stores 256 KiB of a packet
 INTERFACES_MOST = 1000
-VOTERS = 1000  # frames by which the byte order of identifiers is told
+VOTERS = 1000  # frames that tell the byte order of identifiers
 
 _PCAP = {b"\xa1\xb2\xc3\xd4": (">", 1000), b"\xd4\xc3\xb2\xa1": ("<", 1000),
          b"\xa1\xb2\x3c\x4d": (">", 1), b"\x4d\x3c\xb2\xa1": ("<", 1)}  # fmt: skip
-"""By the first four bytes: byte order, and nanoseconds of the fraction's unit."""
+"""Byte order, and unit of the fraction [ns], by the first four bytes."""
 _SECTION = b"\x0a\x0d\x0d\x0a"
 _ORDERS = {b"\x1a\x2b\x3c\x4d": ">", b"\x4d\x3c\x2b\x1a": "<"}
 MAGICS = (*_PCAP, _SECTION)
@@ -59,7 +59,7 @@ class _Packet(NamedTuple):
 
 
 class _Inner(NamedTuple):
-    """What is behind a cooked header: ``order`` is that of the identifier."""
+    """Content after a cooked header. ``order`` is the byte order of the identifier."""
 
     frame: bytes
     protocol: int | None
@@ -110,7 +110,7 @@ def _pcap(stream: BinaryIO, magic: bytes, account: Account) -> Iterator[_Packet]
 
 class _Interface(NamedTuple):
     link: int
-    units: tuple[int, int]  # a time times the first, through the second, is nanoseconds
+    units: tuple[int, int]  # nanoseconds are the time times the first, divided by the second
     offset_ns: int
     name: str
 
@@ -171,7 +171,7 @@ def _block(kind: bytes, body: bytes, section: _Section, where: str, account: Acc
 
 
 def _packet(section: _Section, number: int, time: int | None, data: bytes, where: str) -> _Packet:
-    """Raises IndexError where there is no such interface."""
+    """Raises IndexError if there is no such interface."""
     interface = section.interfaces[number]
     over, under = interface.units
     time_ns = None if time is None else time * over // under + interface.offset_ns
@@ -200,8 +200,8 @@ def _interface(body: bytes, order: str, number: int) -> _Interface:
 
 
 def _inner(packet: _Packet, account: Account) -> _Inner | None:
-    """Identifiers are in network order, but as the host had them behind a
-    cooked header."""
+    """The frame in a packet. Identifiers are in network order; after a cooked header
+    they are in the host's order."""
     data = packet.data
     if packet.link == _SOCKETCAN:
         return _Inner(data, None, False, packet.channel, ">")
@@ -221,8 +221,7 @@ def _inner(packet: _Packet, account: Account) -> _Inner | None:
 
 
 def _swapped(inner: list[_Inner]) -> bool:
-    """Whether identifiers make sense only in the other byte order than they
-    should have."""
+    """Whether more identifiers are plausible in the other byte order."""
     return sum(_plausible(i, _other(i.order)) for i in inner) > sum(_plausible(i, i.order) for i in inner)
 
 

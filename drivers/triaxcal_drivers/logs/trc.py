@@ -1,7 +1,7 @@
 """PEAK's TRC, versions 1.0 to 2.1: text, a line for each message.
 
-Ours, and not python-can's: that one ends with the first damaged line, and reads
-no error frames and no version 1.2.
+python-can's reader is not used: it ends at the first damaged line, and reads neither
+error frames nor version 1.2.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from triaxcal_drivers.logs.can_frames import (
 
 LINE = re.compile(rb"\s*\d+\)?\s+\d+(?:\.\d+)?\s+\S+\s+\S+")
 HEAD = re.compile(rb";(?:\$FILEVERSION\s*=|\$STARTTIME\s*=|#{40})")
-_MILLISECONDS = re.compile(r"(\d{1,15})(?:\.(\d{1,6})\d*)?$", re.A)  # behind the point, down to nanoseconds
+_MILLISECONDS = re.compile(r"(\d{1,15})(?:\.(\d{1,6})\d*)?$", re.A)  # with digits down to nanoseconds
 _DAYS = re.compile(r"\d{1,6}(?:\.\d*)?$", re.A)
-_DAY_ZERO = 25569  # days from TRC's, 1899-12-30, to the epoch
+_DAY_ZERO = 25569  # days from the origin of TRC, 1899-12-30, to the epoch
 _DAY_NS = 86_400_000_000_000
 _COLUMNS: Mapping[str, str] = {
     "1.0": "NOIlD",
@@ -43,8 +43,8 @@ _COLUMNS: Mapping[str, str] = {
     "1.2": "NOBdIlD",
     "1.3": "NOBdIRlD",
 }
-"""By the letters of ``$COLUMNS``, which files before 2.0 do not have. In 1.x the
-direction may be ``Warng`` or ``Error``."""
+"""Columns by version, in the letters of ``$COLUMNS``, a line that files before 2.0 do
+not have. In 1.x the direction may be ``Warng`` or ``Error``."""
 _TYPES = {
     "DT": 0,
     "FD": FD,

@@ -9,8 +9,7 @@ from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
-    from triaxcal_drivers.mcap.driver import McapProfile, schema_file, stream_reader
-    from triaxcal_drivers.mcap.messages import MessageSchema
+    from triaxcal_drivers.mcap.driver import McapProfile, MessageSchema, schema_file, stream_reader
 
 _NAMES = {
     "container": (
@@ -20,10 +19,10 @@ _NAMES = {
     ),
     "driver": (
         "McapProfile",
+        "MessageSchema",
         "schema_file",
         "stream_reader",
     ),
-    "messages": ("MessageSchema",),
 }
 
 __all__ = [

@@ -1,7 +1,7 @@
-"""The messages in an MCAP file that others wrote, bounded before they are read.
+"""Messages in an MCAP file of another program, with lengths checked before reading.
 
-mcap's own readers believe the lengths they read, and those of
-`triaxcald.recording` expect files of ours.
+The readers of the mcap library trust the lengths in a file, and those of
+`triaxcald.recording` expect files of triaxcal.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from triaxcal_drivers.logs.can_frames import Account
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_MOST = 64 * 2**20
-"""Bytes of a record; a chunk holds 4 MiB by most writers' settings, and one
-image more where it is larger."""
+"""Most bytes of a record. A chunk has 4 MiB by most writers' settings, and more if one
+image is larger."""
 UNPACKED_MOST = 64 * 2**20  # of a chunk
 EXPANSION_MOST, ROOM = 64, 64 * 2**20
-"""So many times its size, and so many bytes more, a file may unpack to."""
+"""A file may unpack to `EXPANSION_MOST` times its size plus `ROOM` bytes."""
 NAMED_MOST = 10_000  # schemas and channels, each; a robot has some hundred topics
 
 _HEAD = struct.Struct("<BQ")
@@ -39,7 +39,7 @@ class Schema(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """``metadata`` are names and values that its publisher says of itself."""
+    """``metadata`` are the publisher's own names and values."""
 
     schema: Schema | None
     topic: str
@@ -56,7 +56,7 @@ class LoggedMessage(NamedTuple):
 
 @dataclass
 class McapFile:
-    """``topics`` are those that were declared up to where it has been read."""
+    """``topics`` are the topics declared so far."""
 
     stream: BinaryIO
     account: Account
@@ -69,7 +69,8 @@ class McapFile:
         self._unpacked = 0
 
     def messages(self) -> Iterator[LoggedMessage]:
-        """From the file's start. What cannot be read is noted."""
+        """All messages from the file's start. Counts unreadable places in the
+        account."""
         at = len(MAGIC)
         while at < self._size:
             where = f"byte {at}"
@@ -81,6 +82,7 @@ class McapFile:
             code, length = _HEAD.unpack(head)
             if code in _ENDS:
                 return
+            # The record must end within the file.
             at += _HEAD.size + length
             if at > self._size:
                 self.account.note(where, "the file ends in a record")
@@ -93,8 +95,8 @@ class McapFile:
         self.account.note(f"byte {at}", "the file ends without its end")
 
     def _record(self, code: int, body: bytes, where: str) -> Generator[LoggedMessage, None, bool]:
-        """One record of the file, or, with its chunk's place, of a chunk;
-        whether it is what it should be."""
+        """Messages of one record, of the file or of a chunk; ``where`` is its place, or
+        that of the chunk. Returns whether the record is valid."""
         try:
             if code == _CHUNK_CODE:
                 yield from self._chunk(body, where)
@@ -107,16 +109,19 @@ class McapFile:
             return False
 
     def _chunk(self, body: bytes, where: str) -> Iterator[LoggedMessage]:
+        # Check the size before unpacking.
         _, _, size, crc, length = _CHUNK.unpack_from(body)
         compression = body[_CHUNK.size : _CHUNK.size + length].decode()
         self._unpacked += size
         if size > UNPACKED_MOST or self._unpacked > EXPANSION_MOST * self._size + ROOM:
             self.account.note(where, f"a chunk that unpacks to {size} bytes, which is more than there may be")
             return
+        # Unpack and check size and CRC.
         data = _unpack(body[_CHUNK.size + length + 8 :], compression, size)
         if data is None or len(data) != size or crc not in (0, zlib.crc32(data)):
             self.account.note(where, f"a chunk ({compression or 'not compressed'}) that cannot be unpacked")
             return
+        # Read the records in the chunk.
         at = 0
         while at + _HEAD.size <= len(data):
             code, count = _HEAD.unpack_from(data, at)
@@ -125,7 +130,7 @@ class McapFile:
                 self.account.note(where, "a chunk with a record that is none")
                 return
             if not (yield from self._record(code, data[at : at + count], where)):
-                return  # so that a chunk of a million bad records is one of them
+                return  # a chunk of a million bad records counts once
             at += count
 
     def _message(self, body: bytes, where: str) -> Generator[LoggedMessage, None, bool]:
@@ -137,7 +142,8 @@ class McapFile:
         return True
 
     def _declare(self, code: int, body: bytes, where: str) -> bool:
-        """Raises struct.error, UnicodeDecodeError."""
+        """Stores a schema or channel; whether there was room for it. Raises
+        struct.error, UnicodeDecodeError."""
         known: dict[int, Schema] | dict[int, Channel] = self._schemas if code == _SCHEMA else self._channels
         if len(known) >= NAMED_MOST:
             self.account.note(where, f"more than {NAMED_MOST} schemas or channels")
@@ -158,8 +164,7 @@ class McapFile:
 
 
 def _pairs(body: bytes, at: int) -> tuple[tuple[str, str], ...]:
-    """A map of texts; none where that is not whole, as nothing depends on
-    it."""
+    """A map of texts; empty if it is damaged, as no sample depends on it."""
     found = []
     try:
         (length,) = struct.unpack_from("<I", body, at)
@@ -182,7 +187,7 @@ def _text(body: bytes, at: int) -> tuple[str, int]:
 
 
 def _unpack(data: bytes, compression: str, size: int) -> bytes | None:
-    """None where it cannot be."""
+    """The unpacked data; None if they cannot be unpacked."""
     if compression == "":
         return data
     if compression == "zstd":
@@ -196,7 +201,7 @@ def _unpack(data: bytes, compression: str, size: int) -> bytes | None:
 
 
 def _lz4(data: bytes, size: int) -> bytes | None:
-    """ModuleNotFoundError without lz4, which the extra ``logs`` brings."""
+    """Raises ModuleNotFoundError without lz4, which the extra ``logs`` installs."""
     from lz4.frame import LZ4FrameDecompressor
 
     try:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
+    from triaxcal_drivers.modbus.line import serve_serial, serve_tcp
     from triaxcal_drivers.modbus.model import ModbusBus
     from triaxcal_drivers.modbus.protocol import (
         DEVICE_FAILURE,
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
         TcpAddress,
         Unanswered,
     )
-    from triaxcal_drivers.modbus.stack import serve_serial, serve_tcp
 
 _NAMES = {
     "model": ("ModbusBus",),
@@ -32,7 +32,7 @@ _NAMES = {
         "TcpAddress",
         "Unanswered",
     ),
-    "stack": (
+    "line": (
         "serve_serial",
         "serve_tcp",
     ),

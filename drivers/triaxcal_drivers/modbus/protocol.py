@@ -24,12 +24,12 @@ _REASONS = {
     11: "gateway target device failed to respond",
 }
 GATEWAY_CODES = frozenset({0x0A, 0x0B})
-"""By which a gateway says that it has not reached the unit, or had no answer
-from it: the unit may have done what was asked, and has refused nothing."""
+"""Exceptions of a gateway that has not reached the unit, or had no answer from it. The
+unit may have carried out the request, and has refused nothing."""
 
 
 class ModbusRefusal(DriverError):
-    """The device answered with an exception; ``code`` is the protocol's."""
+    """The device answered with an exception. ``code`` is the protocol's."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception 0x{code:02X} ({_REASONS.get(code, 'unknown')})")
@@ -37,8 +37,8 @@ class ModbusRefusal(DriverError):
 
 
 class MalformedReply(DriverError):
-    """A reply of the wrong function, length or address; ``pdu`` is what came,
-    function code first."""
+    """A reply of the wrong function, length or address. ``pdu`` is that reply, function
+    code first."""
 
     def __init__(self, message: str, pdu: bytes) -> None:
         super().__init__(message)
@@ -46,17 +46,17 @@ class MalformedReply(DriverError):
 
 
 class Misanswered(DeviceSilent):
-    """Something came while a reply was waited for, and it was not the reply."""
+    """Other bytes than the reply came during the time-out."""
 
 
-class Spoiled(Misanswered):
-    """Bytes came in place of the reply to a read, and then the line was silent:
-    noise has spoiled it. Nobody waited for the time-out."""
+class DamagedReply(Misanswered):
+    """Noise damaged the reply to a read: other bytes came, and then the line was
+    silent. Raised before the time-out."""
 
 
 @dataclass(frozen=True)
 class TcpAddress:
-    """``port`` 0, for a unit that is served: one that is free."""
+    """``port`` 0 means any free port, for a unit that this process serves."""
 
     host: str
     port: int
@@ -87,8 +87,8 @@ class SerialLine:
         return f"{self.baudrate} baud, parity {self.parity}, {self.stopbits} stop bits"
 
     def read_s(self, words: int) -> float:
-        """The least time for which a read of so many registers keeps the line:
-        request and reply with their gaps, of a unit that answers at once."""
+        """Shortest time [s] for which a read of so many registers occupies the line:
+        its request, its reply and their gaps, for a unit that answers at once."""
         request, reply = 8, 5 + 2 * words
         return (request + reply) * self.character_s + 2 * self.frame_gap_s
 
@@ -103,8 +103,7 @@ class Unanswered(Exception):
 
 
 class Handler(Protocol):
-    """What a served unit does. While ``alive`` is False it leaves every request
-    without a reply."""
+    """A served unit. It answers no request while ``alive`` is False."""
 
     def alive(self) -> bool: ...
 
@@ -116,8 +115,8 @@ class Handler(Protocol):
 
 
 def answer(handler: Handler, pdu: bytes) -> bytes:
-    """The reply PDU to a request PDU, an exception where the request is wrong
-    or refused."""
+    """The reply PDU to a request PDU; an exception if the request is wrong or
+    refused."""
     try:
         return _carry_out(handler, pdu)
     except ModbusRefusal as e:

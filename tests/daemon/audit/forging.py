@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from triaxcald.documents import to_text
-from triaxcald.recording.retention import Inventory
+from triaxcald.recording.manifest import Inventory
 
 OUTCOME, END = "outcome.json", "end"
 AFTER_THE_END = ("raw", END, "recovery")

@@ -13,7 +13,7 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcald.audit import audit, text
 from triaxcald.audit.differences import differing
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import decode_raw, encode_raw
+from triaxcald.recording.schema import decode_raw, encode_raw
 
 pytestmark = pytest.mark.slow
 

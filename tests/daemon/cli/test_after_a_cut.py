@@ -25,7 +25,7 @@ every_transport = pytest.mark.parametrize("transport", TRANSPORTS)
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.5)
+    monkeypatch.setattr("triaxcald.provision.access.RECONNECT_S", 0.5)
 
 
 def cut_short(bench: Bench) -> Path:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from tests.half_turns import HANDS, stood
 from triaxcal.effects import effect_named
 from triaxcal.frames.faces import LABELS, axis_of
-from triaxcal.frames.fixture import SyntheticFixture
+from triaxcal.frames.unit_frames import SyntheticFixture
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcald.cli.commands import main

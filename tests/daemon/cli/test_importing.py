@@ -19,8 +19,8 @@ import pytest
 from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawFlag
-from triaxcald.recording.file import RecordingFile
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.writer import RecordingFile
 
 Run = Callable[..., Any]
 NODE = 5

@@ -46,7 +46,7 @@ def _a_signal_that_nobody_heeds_does_not_end_the_tests() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.3)
+    monkeypatch.setattr("triaxcald.provision.access.RECONNECT_S", 0.3)
 
 
 async def _long() -> None:

@@ -20,8 +20,7 @@ from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.running import run
 from triaxcald.errors import DiskError, RecordingError, exit_code_of
 from triaxcald.memory import ran_out_of_memory
-from triaxcald.recording.file import RecordingFile
-from triaxcald.recording.writer import RecordingWriter
+from triaxcald.recording.writer import RecordingFile, RecordingWriter
 from triaxcald.run.endings import aborted
 from triaxcald.run.reasons import reason_of, trace_of
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcald.recording.raw_batch import decode_raw, encode_raw
+from triaxcald.recording.schema import decode_raw, encode_raw
 
 Run = Callable[..., Any]
 

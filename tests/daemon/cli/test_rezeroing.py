@@ -14,8 +14,7 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.interchange.calibration_reading import calibration_of
-from triaxcal.model.bias_directions import bias_directions
-from triaxcal.model.directions import cube_directions
+from triaxcal.model.directions import bias_directions, cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.documents import to_text

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, RegisterRefused
-from triaxcald.provision.access import RegisterAccess, RegisterLink
-from triaxcald.provision.sequence import run_sequence
+from triaxcald.provision.access import RegisterAccess, RegisterLink, run_sequence
 
 NOT_OPEN = "the device is not open"
 

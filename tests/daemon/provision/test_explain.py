@@ -1,7 +1,6 @@
 import pytest
 
-from triaxcald.provision.explain import explain
-from triaxcald.provision.registers import Snapshot, take_snapshot
+from triaxcald.provision.registers import Snapshot, explain, take_snapshot
 
 
 @pytest.mark.parametrize("little_endian", [False, True])

@@ -20,7 +20,7 @@ SCRIPT = Path(__file__).parents[3] / "docs/reference/misbehaving-devices.py"
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Longer than any row is silent or busy that comes back."""
-    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 2.5)
+    monkeypatch.setattr("triaxcald.provision.access.RECONNECT_S", 2.5)
     monkeypatch.setattr("triaxcal_drivers.BUSY_S", 2.5)
 
 

@@ -14,7 +14,7 @@ from tests.devices.profiles import profile_text
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import DeviceBusy, DeviceSilent, RegisterRefused
 from triaxcald.provision.access import Clock
-from triaxcald.provision.power import least_off_s, power_cycled
+from triaxcald.provision.restart_check import least_off_s, power_cycled
 
 PROFILE = parse_bundle(profile_text("modbus", Habits()).encode(), {}, where="a profile").profile
 

@@ -16,9 +16,8 @@ from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import ProvisionError
 from triaxcald.provision.access import RegisterAccess, RegisterLink
-from triaxcald.provision.explain import explain
 from triaxcald.provision.procedure import Provisioning, restore
-from triaxcald.provision.registers import build_image
+from triaxcald.provision.registers import build_image, explain
 from triaxcald.provision.state import DeviceState
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.modbus_unit import ModbusUnit

@@ -9,12 +9,11 @@ import pytest
 
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcald.audit.traffic import Traffic
-from triaxcald.provision.access import RegisterAccess
+from triaxcald.provision.access import RegisterAccess, SequenceStalled
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import build_image
 from triaxcald.provision.restart_check import Restart, checked_restart, may_probe
-from triaxcald.provision.sequence import SequenceStalled
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording import schema
 from triaxcald.simulation.unit import Faults

@@ -4,8 +4,8 @@ import pytest
 
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import PollStep, ReconnectStep, Register, Sequences, WaitStep, WriteStep
+from triaxcald.provision.access import SequenceStalled, reconnect, run_sequence
 from triaxcald.provision.identity import WrongUnit, check_identity
-from triaxcald.provision.sequence import SequenceStalled, reconnect, run_sequence
 
 UNLOCK = WriteStep(write="unlock_key", value=0x5A17)
 

@@ -22,10 +22,9 @@ from tests.devices.profiles import Timing, calibration_text, profile_text
 from tests.devices.table import NEW, OLD
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Bundle
-from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.access import RegisterLink, SequenceStalled, run_sequence
 from triaxcald.provision.identity import WrongUnit, check_identity, same_serial
 from triaxcald.provision.registers import checksum_of
-from triaxcald.provision.sequence import SequenceStalled, run_sequence
 from triaxcald.recording.reader import Recording
 
 SerialType = Literal["uint64", "int64"]

@@ -19,9 +19,9 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import DISK, DiskError
 from triaxcald.recording import disk
 from triaxcald.recording import writer as writer_module
+from triaxcald.recording.manifest import Retention
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
-from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 

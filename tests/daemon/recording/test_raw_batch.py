@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import Fields, batch_of, decode_raw, encode_raw, fields_of
+from triaxcald.recording.schema import Fields, batch_of, decode_raw, encode_raw, fields_of
 
 TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
 

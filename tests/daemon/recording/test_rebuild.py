@@ -14,9 +14,8 @@ import pytest
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import rebuild
 from triaxcald.recording.manifest import Segment, load_manifest
-from triaxcald.recording.reader import Recording
+from triaxcald.recording.reader import Recording, Series
 from triaxcald.recording.segments import SegmentedWriter
-from triaxcald.recording.series import Series
 from triaxcald.recording.writer import RecordingWriter
 
 S = 1_000_000_000

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import RecordingError
-from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.tables.native_csv import read_csv
+from triaxcald.tables.native_csv import Rows, read_csv, write_csv
 
 T0_NS = 1_700_000_000_000_000_000
 

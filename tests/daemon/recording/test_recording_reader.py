@@ -10,10 +10,10 @@ from mcap.writer import Writer as McapWriter
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
-from triaxcald.recording import contents, reader, schema
+from triaxcald.recording import reader, schema
 from triaxcald.recording.mcap_records import MAGIC, UnparsedRecord
-from triaxcald.recording.raw_batch import Fields
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import Fields
 from triaxcald.recording.writer import RecordingWriter
 
 
@@ -76,7 +76,7 @@ def test_records_of_a_phase_come_many_at_a_time_however_few_a_message_has(
         single = [batch for phase, batch in rec.raw_batches() if phase == "calibration"]
         together = dict(rec.joined_batches())
         (joined,) = rec.raw("calibration")
-        monkeypatch.setattr("triaxcald.recording.contents.JOINED", len(single[0]) + 1)
+        monkeypatch.setattr("triaxcald.recording.reader.JOINED", len(single[0]) + 1)
         parts = list(rec.raw("calibration"))
     assert len(single) == 4
     assert list(together) == ["calibration", "verification"]
@@ -94,12 +94,12 @@ def test_of_messages_that_are_read_together_the_one_at_fault_is_named(
 ) -> None:
     with Recording.open(recording) as rec:
         _, second, *_ = (message for topic, message in rec.messages() if topic == schema.RAW)
-    read = contents.fields_of
+    read = reader.fields_of
 
     def spoilt(data: bytes) -> Fields:
         return read(data)._replace(payload=b"") if data == second.data else read(data)
 
-    monkeypatch.setattr(contents, "fields_of", spoilt)
+    monkeypatch.setattr(reader, "fields_of", spoilt)
     with Recording.open(recording) as rec, pytest.raises(RecordingError, match=f"/raw at {second.log_time} ns: "):
         list(rec.raw("calibration"))
 
@@ -113,11 +113,11 @@ def test_messages_without_records_are_not_held_to_the_end_of_the_file(
         held.append(len(messages))
         return RawBatch.of([])
 
-    monkeypatch.setattr(contents, "fields_of", lambda _: Fields(phase=b"calibration", payload=bytes(500)))
-    monkeypatch.setattr(contents, "batch_of", of_nothing)
+    monkeypatch.setattr(reader, "fields_of", lambda _: Fields(phase=b"calibration", payload=bytes(500)))
+    monkeypatch.setattr(reader, "batch_of", of_nothing)
     with Recording.open(recording) as rec:
         shortest = min(len(message.data) for topic, message in rec.messages() if topic == schema.RAW)
-        monkeypatch.setattr(contents, "JOINED_BYTES", 2 * shortest)
+        monkeypatch.setattr(reader, "JOINED_BYTES", 2 * shortest)
         list(rec.raw("calibration"))
     assert max(held) <= 2
 

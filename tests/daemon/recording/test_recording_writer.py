@@ -16,7 +16,6 @@ from mcap_protobuf.decoder import DecoderFactory
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
-from triaxcald.recording import file as file_module
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -53,7 +52,7 @@ def disks(monkeypatch: pytest.MonkeyPatch) -> list[Disk]:
         made.append(Disk(path))
         return io.BufferedWriter(made[-1])
 
-    monkeypatch.setattr(file_module, "_create", create)
+    monkeypatch.setattr(writer_module, "_create", create)
     return made
 
 

@@ -6,8 +6,7 @@ import dataclasses
 
 import pytest
 
-from triaxcald.recording.manifest import Segment
-from triaxcald.recording.retention import Retention, surplus
+from triaxcald.recording.manifest import Retention, Segment, surplus
 
 DAY_S = 86_400
 NOW_NS = 100 * DAY_S * 10**9

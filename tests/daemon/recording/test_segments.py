@@ -17,12 +17,10 @@ from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.info import describe
-from triaxcald.recording.manifest import load_manifest
-from triaxcald.recording.reader import Recording
+from triaxcald.recording.manifest import Retention, load_manifest
+from triaxcald.recording.reader import Recording, Series, digest_of
 from triaxcald.recording.recover import recover
-from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import AWAY, SegmentedWriter
-from triaxcald.recording.series import Series, digest_of
 from triaxcald.recording.survey import survey
 
 T0_NS = 1_700_000_000_000_000_000

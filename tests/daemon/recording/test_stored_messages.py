@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import decode_raw, encode_raw
+from triaxcald.recording.schema import decode_raw, encode_raw
 
 RECORDINGS = sorted((Path(__file__).parents[3] / "recordings").glob("*.mcap"))
 NAMES = [file.stem for file in RECORDINGS]

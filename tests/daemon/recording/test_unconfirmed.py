@@ -12,10 +12,9 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import schema
 from triaxcald.recording.info import describe
 from triaxcald.recording.manifest import load_manifest
-from triaxcald.recording.reader import Recording
+from triaxcald.recording.reader import Recording, Series
 from triaxcald.recording.recover import recover
 from triaxcald.recording.segments import SegmentedWriter
-from triaxcald.recording.series import Series
 from triaxcald.recording.survey import survey
 
 BatchOf = Callable[..., RawBatch]

@@ -14,7 +14,7 @@ from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.memory import Hysteresis
 from triaxcal.effects.runs import InRuns, RunBias, RunScaleFactor
 from triaxcal.effects.time import BiasDrift
-from triaxcald.report.meanings import factor, in_plain, told
+from triaxcald.report.figures import factor, in_plain, told
 
 FORMS = [form for effect in (*CATALOGUE, effect_named("channel_bias:fan rpm")) for form in effect.forms]
 FORMS += [effect_named("channel_scale_factor:supply_v"), *(BiasDrift(d) for d in (1, 2, 3))]

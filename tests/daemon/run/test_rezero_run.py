@@ -15,7 +15,7 @@ import pytest
 
 from tests.conftest import Workshop
 from tests.virtual_line import described, virtual_line
-from triaxcal.model.bias_directions import bias_directions
+from triaxcal.model.directions import bias_directions
 from triaxcald.audit import audit
 from triaxcald.audit.conduct import Result
 from triaxcald.cli.commands import main

@@ -25,7 +25,7 @@ PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2, "comes_back_s": 0.5}
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.5)
+    monkeypatch.setattr("triaxcald.provision.access.RECONNECT_S", 0.5)
 
 
 def _holds_old(served: Any) -> None:

@@ -42,7 +42,7 @@ NO_ROOM = "rec.mcap: writing failed: No space left on device"
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.3)
+    monkeypatch.setattr("triaxcald.provision.access.RECONNECT_S", 0.3)
 
 
 class Quiet:

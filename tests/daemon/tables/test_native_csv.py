@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from triaxcald.errors import InputError
-from triaxcald.tables import source
+from triaxcald.tables import native_csv
 from triaxcald.tables.native_csv import CsvSamples, read_csv
 
 HEAD = b"t_s,ux,uy,uz\n"
@@ -96,7 +96,7 @@ def test_a_fault_is_told_with_its_line_its_field_and_what_was_expected(text: byt
 
 
 def test_a_fault_far_into_a_long_file_has_the_right_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(source, "BLOCK", 64)
+    monkeypatch.setattr(native_csv, "BLOCK", 64)
     good = HEAD + b"# c\n" + b"".join(b"%d.5,1,2,3\n" % i for i in range(500))
     assert len(read(good).time_ns) == 500
     with pytest.raises(InputError, match=r"line 503: field uy: 'x'"):
@@ -110,7 +110,7 @@ def test_a_fault_far_into_a_long_file_has_the_right_line(monkeypatch: pytest.Mon
 def test_rows_that_repeat_exactly_are_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     text = HEAD + b"0,1,2,3\n" * 3 + b"1,4,5,6\n" * 2
     for block in (2**22, 8):
-        monkeypatch.setattr(source, "BLOCK", block)
+        monkeypatch.setattr(native_csv, "BLOCK", block)
         found = read(text)
         assert found.time_ns.tolist() == [0, 1_000_000_000]
         assert found.duplicates == 3
@@ -129,7 +129,7 @@ def test_the_samples_do_not_depend_on_how_the_text_is_cut(
     for at in comments:
         lines.insert(min(at, len(lines)), "# a comment\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(source, "BLOCK", block)
+        patch.setattr(native_csv, "BLOCK", block)
         found = read(HEAD + "".join(lines).encode())
     assert found.readings.tolist() == [list(row) for row in readings]
 

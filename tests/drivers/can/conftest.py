@@ -8,8 +8,8 @@ import pytest
 
 from tests.drivers.can.played import Played
 from triaxcal_drivers.can import line as can_line
-from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.driver import CanDecoder
+from triaxcal_drivers.can.layout import stream_layout
 from triaxcal_drivers.can.model import BusSettings, DbcStream, PdoStream
 from triaxcal_drivers.catalogue import BUILT_IN, load_bundle, parse_bundle
 from triaxcal_drivers.interface import RawBatch, SampleBlock

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from triaxcal_drivers.can.decode import LATEST, CanDecoder
-from triaxcal_drivers.can.driver import CanDriver
+from triaxcal_drivers.can.driver import LATEST, CanDecoder, CanDriver
 from triaxcal_drivers.can.layout import Layout, Message, Signal
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.profile import Bundle

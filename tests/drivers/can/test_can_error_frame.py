@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcal_drivers.can.error_frame import ControllerState, ErrorClass, ErrorFrame, error_frame
+from triaxcal_drivers.can.adapter import ControllerState, ErrorClass, ErrorFrame, error_frame
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from canopen.objectdictionary import datatypes
 
-from triaxcal_drivers.can.description import object_dictionary, pdo_messages, stream_layout
 from triaxcal_drivers.can.driver import CanDriver
+from triaxcal_drivers.can.layout import object_dictionary, pdo_messages, stream_layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, PdoStream, object_address
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import ProfileError

@@ -7,8 +7,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from triaxcal_drivers.can.description import dbc_messages
-from triaxcal_drivers.can.layout import Signal
+from triaxcal_drivers.can.layout import Signal, dbc_messages
 
 
 @st.composite

@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from triaxcal_drivers.can import socketcan
-from triaxcal_drivers.can.adapter import Frame
-from triaxcal_drivers.can.error_frame import ControllerState
+from triaxcal_drivers.can.adapter import ControllerState, Frame
 from triaxcal_drivers.can.model import CanBus, SocketCanOptions
 from triaxcal_drivers.can.socketcan import (
     AT_ONCE,

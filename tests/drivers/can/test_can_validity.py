@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from triaxcal_drivers.can.decode import CanDecoder
-from triaxcal_drivers.can.driver import CanDriver
+from triaxcal_drivers.can.driver import CanDecoder, CanDriver
 from triaxcal_drivers.can.layout import Layout, Message, Signal
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle

@@ -14,7 +14,7 @@ import pytest
 
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
-from triaxcal_drivers.logs.mf4 import frames, look_through
+from triaxcal_drivers.logs.mf4 import check_blocks, frames
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 ID = b"MDF     4.11    " + bytes(12) + struct.pack("<H", 411) + bytes(34)
@@ -51,7 +51,7 @@ def group(cycles: int, record: int) -> bytes:
 )  # fmt: skip
 def test_a_file_that_says_more_than_it_can_hold_is_refused_with_its_place(data: bytes, words: str) -> None:
     with pytest.raises(LogError) as caught:
-        look_through(io.BytesIO(data))
+        check_blocks(io.BytesIO(data))
     assert words in str(caught.value)
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.mcap.driver import MessageDecoder, MessageStream
-from triaxcal_drivers.mcap.messages import MessageSchema, Read, reader
+from triaxcal_drivers.mcap.driver import MessageDecoder, MessageSchema, MessageStream, Read, reader
 
 STREAM = MessageStream.model_validate(
     {"topic": "/imu", "time": "stamp", "channels": {"ux": "a.0", "uy": "a.1", "uz": "a.2"}}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.mcap.messages import DEEPEST, CdrReader, Fields, message_types
+from triaxcal_drivers.mcap.driver import DEEPEST, CdrReader, Fields, message_types
 
 rosbags = pytest.importorskip("rosbags.typesys")
 

@@ -12,9 +12,9 @@ import pytest
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent
 from triaxcal_drivers.modbus.device import ModbusDevice
+from triaxcal_drivers.modbus.line import serve_serial
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import Handler, SerialLine, answer
-from triaxcal_drivers.modbus.stack import serve_serial
 from triaxcald.simulation.modbus_unit import pty_pair
 
 Make = Callable[..., Any]

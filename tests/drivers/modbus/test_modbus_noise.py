@@ -18,7 +18,7 @@ from tests.devices.table import crc16
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
-from triaxcal_drivers.modbus.protocol import Spoiled
+from triaxcal_drivers.modbus.protocol import DamagedReply
 
 Make = Callable[..., Any]
 PROBE = ("11 04 00 08 00 01 B2 98", "11 04 02 00 0A F8 F4")
@@ -150,7 +150,7 @@ async def test_a_register_whose_reply_was_spoiled_can_be_read_again_at_once(bund
     script = PROBE, (asked, "55 aa"), (asked, reply)
     async with serial_device(*script) as heard, asyncio.timeout(50):
         device = await opened(bundle, heard.path, *PATIENT)
-        with pytest.raises(Spoiled, match="2 bytes came, and no whole reply"):
+        with pytest.raises(DamagedReply, match="2 bytes came, and no whole reply"):
             await device.read("setting")
         assert await device.read("setting") == b"\x00\x0b"
         await device.close()
@@ -171,7 +171,7 @@ async def test_the_reply_that_follows_noise_is_not_taken_for_that_of_another_reg
 
     loop.add_reader(master, answer)
     device = await opened(bundle, os.ttyname(slave), *PATIENT)
-    with pytest.raises(Spoiled):
+    with pytest.raises(DamagedReply):
         await device.read("setting")
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.2):

@@ -21,7 +21,7 @@ from triaxcal_drivers.errors import (
     RegisterValueError,
 )
 from triaxcal_drivers.interface import RawBatch, RawFlag
-from triaxcal_drivers.modbus import stack
+from triaxcal_drivers.modbus import line
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
 
@@ -252,14 +252,14 @@ async def test_a_late_reply_on_a_serial_line_does_not_show_that_the_device_is_ba
     await device.open()
     with pytest.raises(DeviceSilent):
         await device.read("setting")
-    open_serial = stack._open_serial
+    open_serial = line._open_serial
 
     async def open_and_hear_the_late_reply(*where):
         link = await open_serial(*where)
         os.write(master, bytes.fromhex("11 03 02 00 0A F9 80"))
         return link
 
-    monkeypatch.setattr(stack, "_open_serial", open_and_hear_the_late_reply)
+    monkeypatch.setattr(line, "_open_serial", open_and_hear_the_late_reply)
     with pytest.raises(DeviceAbsent):
         await device.open()
     loop.remove_reader(master)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.guest.inside.controller import Controller
 from tests.guest.inside.witness import received, wait_until
-from triaxcal_drivers.can.error_frame import ControllerState, ErrorClass, ErrorFrame, error_frame
+from triaxcal_drivers.can.adapter import ControllerState, ErrorClass, ErrorFrame, error_frame
 from triaxcal_drivers.can.socketcan import read_link
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag

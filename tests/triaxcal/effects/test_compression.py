@@ -13,7 +13,7 @@ from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import BEFORE
 from triaxcal.effects.nonlinear import KINDS, KNEES, Compression
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import observability

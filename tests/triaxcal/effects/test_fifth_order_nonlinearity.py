@@ -11,7 +11,7 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.nonlinear import FifthOrderNonlinearity
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.model.directions import directions, linear_design
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import combinations, observability, radial

@@ -14,7 +14,7 @@ from triaxcal.effects.contract import BEFORE
 from triaxcal.effects.memory import Hysteresis, Remanence
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.synthetic import noisy_poses

@@ -11,7 +11,7 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.time import BiasDrift, ScaleFactorDrift
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

@@ -16,7 +16,7 @@ from triaxcal.effects.thermal import TemperatureLag
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.findings import NotIdentifiable, Why
+from triaxcal.evidence.posterior import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import channels_of, covariates_elsewhere, lag_deviation, lags_for
 from triaxcal.poses.pose import Pose, Run

@@ -11,8 +11,8 @@ from scipy import stats
 
 from triaxcal.diagnosis import Verdict, diagnose
 from triaxcal.effects import effect_named
+from triaxcal.effects.catalogue import PluginEffect
 from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
-from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
 from triaxcal.estimate.creep import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.estimate.fit_assessment import Excess, cross_validated
@@ -20,7 +20,7 @@ from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import State, linearise, linearise_all, residual_sum_of_squares, solve
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Posterior, Refusal, posterior_of
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import StillnessDetector
@@ -246,7 +246,7 @@ def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_left_o
     poses = moving(paper_unit, twenty_six, np.random.default_rng(4), ((TEMPERATURE, SENSITIVITY),))
     means = np.array([p.channels["temp_c"] for p in poses])
     table = Table(end_k=float(np.abs(means - round(float(means.mean()), 1)).max()) + 1e-4)
-    loop = diagnose(poses, signs=MINUS, catalogue=[Foreign(table, "the package of a table")])
+    loop = diagnose(poses, signs=MINUS, catalogue=[PluginEffect(table, "the package of a table")])
     ((name, why),) = loop.faulty.items()
     assert name == "table"
     assert "outside the table" in why
@@ -254,7 +254,7 @@ def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_left_o
     assert loop.findings == loop.candidates == ()
     assert loop.found.unexplained.kind is UnmodelledKind.TIME
     # Where no slope is known it is asked about.
-    seen = diagnose(blind(poses), signs=MINUS, catalogue=[Foreign(table, "the package of a table")])
+    seen = diagnose(blind(poses), signs=MINUS, catalogue=[PluginEffect(table, "the package of a table")])
     (found,) = seen.findings
     assert (found.effect, found.verdict, found.remedy) == ("table", Verdict.ADOPTED, table.remedy)
     effects = [effect for effect, _ in seen.after.sensor.effects]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import TIME, effect_named
-from triaxcal.estimate.calibration import Calibration, ReferenceEpoch
+from triaxcal.estimate.calibration import Calibration, ReferenceEpoch, reduced
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.projected_calibration import reduced
 from triaxcal.model.directions import directions
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor

@@ -12,7 +12,7 @@ from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.calibration import Calibration, ReferenceEpoch
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
-from triaxcal.evidence.corrected_calibration import corrected
+from triaxcal.evidence.model_average import corrected
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment

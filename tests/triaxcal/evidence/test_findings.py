@@ -11,7 +11,7 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Findings, findings, posterior_of
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 

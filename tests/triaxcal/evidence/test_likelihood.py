@@ -11,10 +11,10 @@ from scipy.special import logsumexp
 
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from triaxcal.effects import CATALOGUE
+from triaxcal.evidence.covariances import PoseInputs
 from triaxcal.evidence.likelihood import Evidence
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import terms_of
-from triaxcal.evidence.unmodelled_kernels import PoseInputs
 from triaxcal.poses.pose import Pose
 
 

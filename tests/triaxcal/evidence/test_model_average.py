@@ -13,7 +13,7 @@ from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.calibration import ReferenceEpoch
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Average, Posterior, Refusal, average, posterior_of, refusal
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

@@ -11,13 +11,13 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
+from triaxcal.evidence.covariances import PoseInputs, UnmodelledKind
 from triaxcal.evidence.likelihood import Evidence
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.next_measurement import Predictive
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import terms_of
-from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledKind
 from triaxcal.poses.pose import Pose
 
 Poses = Callable[..., list[Pose]]

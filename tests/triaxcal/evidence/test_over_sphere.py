@@ -14,9 +14,8 @@ from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.effects.nonlinear import CrossCoupling
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.calibration import Exclusion
-from triaxcal.estimate.projected_calibration import reduced
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.estimate.calibration import Exclusion, reduced
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.directions import directions, spiral
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

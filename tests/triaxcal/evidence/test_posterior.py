@@ -14,7 +14,7 @@ from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Posterior, Refusal, posterior_of, refusal
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

@@ -9,8 +9,7 @@ from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.arrays import Floats
 from triaxcal.effects import effect_named
 from triaxcal.effects.time import MOMENTS
-from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.poses_from_means import poses_of_means
+from triaxcal.estimate.pose_fit import fit, poses_of_means
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.search import posterior_of
 from triaxcal.evidence.terms import CHANGE_POINTS

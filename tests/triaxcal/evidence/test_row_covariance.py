@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.evidence.row_covariance import LowRank, OwnVariances, inverse_of
+from triaxcal.evidence.covariances import LowRank, OwnVariances, inverse_of
 
 N, TAUS = 30, (0.4, 3.0, 200.0)
 

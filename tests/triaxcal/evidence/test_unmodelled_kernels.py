@@ -10,8 +10,8 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from tests.undeclared.examine import Case, still_poses
+from triaxcal.evidence.covariances import PoseInputs, UnmodelledKind, kinds_of
 from triaxcal.evidence.linearised_data import LinearisedData
-from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledKind, kinds_of
 from triaxcal.poses.pose import Pose
 
 

@@ -16,10 +16,9 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import AXES, LABELS, AxesAssumed, axis_of, labelled, nearest_rotation, recognise
-from triaxcal.frames.fixture import SyntheticFixture
 from triaxcal.frames.orientations import Assumed, NotTurned, verticals, verticals_under
 from triaxcal.frames.standing import OrientationsAlike, SingleOrientation, Standing, stand
-from triaxcal.frames.unit_frames import Datum, FacesMissing, Frames, UnitsDisagree, frames
+from triaxcal.frames.unit_frames import Datum, FacesMissing, Frames, SyntheticFixture, UnitsDisagree, frames
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

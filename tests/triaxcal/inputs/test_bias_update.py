@@ -17,14 +17,13 @@ from triaxcal.effects import effect_named
 from triaxcal.estimate.calibration import BiasUpdate
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.inputs.bias_update import SCALE_FACTOR_SHARE, BiasMoved, Earlier, updated_biases
-from triaxcal.model.bias_directions import bias_directions
-from triaxcal.model.directions import cube_directions
+from triaxcal.model.directions import bias_directions, cube_directions
 from triaxcal.model.samples import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import START_TO_START
+from triaxcal.uncertainty.combined import START_TO_START
 
 UNIT = Sensor(np.array([-2.41, 2.0, 3.1]), np.array([6e-3, 4e-3, -6e-3]), np.array([5e-3, -3e-3, 4e-3]))
 SIGNS = (-1, 1, 1)

@@ -11,7 +11,7 @@ from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.interchange.calibration_document import calibration_document
-from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.interchange.calibration_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

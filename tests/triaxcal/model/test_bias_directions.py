@@ -7,14 +7,14 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from triaxcal.model.bias_directions import (
+from triaxcal.model.directions import (
     bias_dilution,
     bias_directions,
+    cube_directions,
     determined,
     first_distinct,
     wanted_for_biases,
 )
-from triaxcal.model.directions import cube_directions
 
 CUBE = np.array([v for _, v in cube_directions()])
 

@@ -17,8 +17,7 @@ from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.likelihood import solve
 from triaxcal.model.directions import cube_directions, dilution, directions, distinct
 from triaxcal.model.sensor import Sensor
-from triaxcal.planning.design import target_effects
-from triaxcal.planning.optimal_plan import OptimalPlan, bound, optimal
+from triaxcal.planning.design import OptimalPlan, bound, optimal, target_effects
 from triaxcal.synthetic import noisy_poses
 
 SECOND, THIRD = effect_named("second_order_nonlinearity"), effect_named("third_order_nonlinearity")

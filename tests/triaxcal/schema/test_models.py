@@ -20,9 +20,9 @@ from triaxcal.effects.time import BiasStep
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.hold_out import Contradiction
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.partial_residuals import Quantity
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.inputs.bias_update import updated_biases
 from triaxcal.interchange.calibration_document import calibration_document, poses_document
 from triaxcal.model.directions import directions
@@ -32,7 +32,7 @@ from triaxcal.schema import AnotherUnit, Calibration, Finding, HeldOut, Loop, Mo
 from triaxcal.schema.calibration import FittedPose, HoldsAt, NextRecording
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
-from triaxcal.uncertainty.another_day import Source
+from triaxcal.uncertainty.combined import Source
 
 UNIT = Sensor(np.array([-2.41, 2.40, -2.37]), np.array([6e-3, 4e-3, -1e-3]), np.array([5e-3, -3e-3, 4e-3]))
 SIGNS = (-1, 1, -1)

@@ -33,7 +33,7 @@ from triaxcal.inputs.attitude import (
 )
 from triaxcal.inputs.bias_update import BiasMoved
 from triaxcal.inputs.datasheet import DatasheetContradicted, StillOfDatasheet
-from triaxcal.inputs.turning.rotation import StretchesDiffer
+from triaxcal.inputs.rotation import StretchesDiffer
 from triaxcal.poses.pose import PoseStart
 from triaxcal.text import caution
 

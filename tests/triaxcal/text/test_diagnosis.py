@@ -11,14 +11,14 @@ from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict, diagnose
 from triaxcal.estimate.calibration import Residual
 from triaxcal.estimate.hold_out import HoldOut
-from triaxcal.evidence.findings import ChangePoint, Findings, Unexplained
+from triaxcal.evidence.covariances import UnmodelledKind
 from triaxcal.evidence.model_average import Refusal
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.evidence.posterior import ChangePoint, Findings, Unexplained
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, PoseStart
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import NextRecording, Scopes, Source, next_recording
+from triaxcal.uncertainty.combined import NextRecording, Scopes, Source, next_recording
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)

@@ -16,7 +16,7 @@ from triaxcal.poses.covariates import channels_of, covariates, references
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.another_day import START_TO_START, Source, next_recording
+from triaxcal.uncertainty.combined import START_TO_START, Source, next_recording
 
 MINUS = (-1.0, -1.0, -1.0)
 

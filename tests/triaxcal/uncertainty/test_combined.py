@@ -59,7 +59,8 @@ def test_all_sources_together_scatter_as_the_budget_says(
     rng = np.random.default_rng(7)
     reference, thermal_share = 15e-6, 0.04
     monkeypatch.setattr(
-        "triaxcal.uncertainty.thermal.SENSITIVITY_PER_K", {n: v * thermal_share for n, v in SENSITIVITY_PER_K.items()}
+        "triaxcal.uncertainty.components.SENSITIVITY_PER_K",
+        {n: v * thermal_share for n, v in SENSITIVITY_PER_K.items()},
     )
     creep = np.zeros((26, 3))
     creep[::4] = rng.uniform(-1, 1, (7, 3)) * 4e-4

@@ -15,6 +15,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Component, Stated, budget
+from triaxcal.uncertainty.components import _posterior
 from triaxcal.uncertainty.statements import (
     LongerOrMorePoses,
     PosesAtOtherTemperatures,
@@ -23,7 +24,6 @@ from triaxcal.uncertainty.statements import (
     ThermometerNotStated,
     UnmodelledTemperature,
 )
-from triaxcal.uncertainty.thermal import _posterior
 
 NOISE = 2e-5
 SIGNS = (-1, -1, -1)

@@ -21,16 +21,6 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.errors import TooShort
-from triaxcal.poses.stillness.noise_scales import (
-    GUARD,
-    SCALES,
-    SPAN_LEAST_WINDOWS,
-    NoiseScales,
-    contrast,
-    contrasts,
-    trimmed,
-    unbroken,
-)
 from triaxcal.poses.stillness.vibration import (
     ALONE_S,
     MOVE_SIGMA,
@@ -41,7 +31,22 @@ from triaxcal.poses.stillness.vibration import (
     vibration_noise,
     worth_keeping,
 )
-from triaxcal.poses.stillness.windows import RATE_LEAST, Rounding, WindowCutter, Windows, resolution, window_size
+from triaxcal.poses.stillness.windows import (
+    GUARD,
+    RATE_LEAST,
+    SCALES,
+    SPAN_LEAST_WINDOWS,
+    NoiseScales,
+    Rounding,
+    WindowCutter,
+    Windows,
+    contrast,
+    contrasts,
+    resolution,
+    trimmed,
+    unbroken,
+    window_size,
+)
 
 # In-place rotation: a turn about the vertical between poses of the same mean.
 

@@ -20,8 +20,7 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrast, contrasts, trimmed
-from triaxcal.poses.stillness.windows import Windows
+from triaxcal.poses.stillness.windows import SCALES, NoiseScales, Windows, contrast, contrasts, trimmed
 
 LEAST_S = 1.0
 """A shorter rest between vibrations is not distinguished from a pause of the hand."""

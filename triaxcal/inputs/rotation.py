@@ -4,7 +4,7 @@ from streaming moments.
 Ordinary ellipsoid fits to raw samples have a bias of the order of the squared noise,
 which more samples do not reduce. Adjusted least squares (Markovsky, Kukush and Van
 Huffel 2004) corrects the moments of the samples for the noise, and estimates it. It
-needs only the moments up to the fourth degree (`triaxcal.inputs.turning.moments`).
+needs only the moments up to the fourth degree (`triaxcal.inputs.moments`).
 
 The ellipsoid does not show how the axes share the noise; differences from sample to
 sample do, where the unit turns slowly. Stretches of the recording show whether there
@@ -27,7 +27,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration, Caution, Residual
 from triaxcal.estimate.initial_estimate import coefficients
-from triaxcal.inputs.turning.moments import MONOMIALS, Moments, Summary, Temperature
+from triaxcal.inputs.moments import MONOMIALS, Moments, Summary, Temperature
 from triaxcal.model.directions import linear_design, most_wanted
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT

@@ -9,8 +9,8 @@ import pytest
 from scipy import signal, stats
 
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.inputs.turning.moments import MONOMIALS, STRETCHES_MOST, Moments, Temperature
-from triaxcal.inputs.turning.rotation import (
+from triaxcal.inputs.moments import MONOMIALS, STRETCHES_MOST, Moments, Temperature
+from triaxcal.inputs.rotation import (
     CoarseSteps,
     NoiseUnequal,
     NoiseUnseen,
