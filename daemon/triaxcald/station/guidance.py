@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import triaxcal as tc
+from triaxcald.station.faces import described
 
 COVERED_DEG = 25.0
 """Largest angle between a pose and the direction of the plan that it covers."""
@@ -22,7 +23,9 @@ class Guide:
     is the present time of stillness (0 during a motion).
 
     ``missing`` are the labels of the uncovered poses of the plan, in its order.
-    ``repeat_due``: the first pose is wanted once more, after all others.
+    ``repeat_due``: the first pose is wanted once more, after all others; ``repeat`` is
+    the label of the direction of the plan that it is nearest to. ``at`` is that of the
+    present pose, None during a motion and off the plan.
     ``counted_s`` are times inside the poses that were long enough, for the next
     evaluation.
     """
@@ -33,6 +36,8 @@ class Guide:
     hint: str
     missing: tuple[str, ...] = ()
     repeat_due: bool = False
+    repeat: str | None = None
+    at: str | None = None
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
     """Whether poses keep coming in unwanted directions, so that they must suffice."""
@@ -97,20 +102,24 @@ def guide(
         targets = (
             tc.planning.directions(wanted) if plan else tc.planning.elsewhere(np.array(taken), wanted) if taken else []
         )
-    missing = _uncovered(targets, held) if found < wanted else ()
+    # A pose that does not count may cover a direction; at last that is wanted again.
+    missing = (_uncovered(targets, held) or _uncovered(targets, distinct)) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
+    first = _nearest(targets, distinct[0]) if due else None
+    at = next(iter(_covered(targets, up[-1:])), None) if still_s else None
     if (found >= wanted or only_near) and not due:
         hint = "done"
     elif 0 < still_s < hold_s and not enough[-1]:
         hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
     elif due:
-        hint = f"next: {_nearest(targets, distinct[0])}once more: the first pose again shows drift"
+        again = f"{_said(first, targets)} " if first else ""
+        hint = f"next: {again}once more: the first pose again shows drift"
     elif missing:
         hint = f"next: {_said(missing[0], targets)}"
     else:
         hint = "turn the unit to a pose not taken yet"
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
-    return Guide(found, wanted, still_s, hint, missing, due, middles, only_near)
+    return Guide(found, wanted, still_s, hint, missing, due, first, at, middles, only_near)
 
 
 def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
@@ -118,29 +127,31 @@ def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
 
 
 def _uncovered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats]) -> tuple[str, ...]:
-    if not targets or not held:
-        return tuple(label for label, _ in targets)
+    covered = _covered(targets, held)
+    return tuple(label for label, _ in targets if label not in covered)
+
+
+def _covered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats] | tc.Floats) -> set[str]:
+    """Labels of the directions that the poses ``held`` are nearest to, and near
+    enough."""
+    if not targets or not len(held):
+        return set()
     cosines = np.array(held) @ np.array([v for _, v in targets]).T
     nearest = np.argmax(cosines, axis=1)
     close = cosines[np.arange(len(held)), nearest] >= np.cos(np.radians(COVERED_DEG))
-    covered = set(nearest[close].tolist())
-    return tuple(label for i, (label, _) in enumerate(targets) if i not in covered)
+    return {targets[i][0] for i in nearest[close]}
 
 
-def _nearest(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> str:
-    if not targets:
-        return ""
-    label, _ = max(targets, key=lambda target: float(target[1] @ v))
-    return f"{_said(label, targets)} "
+def _nearest(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> str | None:
+    return max(targets, key=lambda target: float(target[1] @ v))[0] if targets else None
 
 
 def _said(label: str, targets: Sequence[tc.planning.Direction]) -> str:
     """The axes that point up; for a direction that only a number names, its
-    components."""
+    description too."""
     if label.startswith(("+", "-")):
         return f"{label} up"
-    x, y, z = next(v for name, v in targets if name == label)
-    return f"{label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+    return f"{label} ({described(next(v for name, v in targets if name == label))})"
 
 
 def ups(poses: Sequence[tc.StillSpan], nominal: Sequence[float] | None) -> tc.Floats:
