@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 import triaxcal as tc
 from triaxcald.abort import add_action, discard_action, steer
@@ -22,6 +23,7 @@ from triaxcald.text import waits
 if TYPE_CHECKING:
     from triaxcald.recording.schema import Phase
     from triaxcald.station.guidance import Guide
+    from triaxcald.station.tray import Instruction
 
 
 # What a command is at, told on standard error while it takes long: one line that is
@@ -223,6 +225,17 @@ class _Shown(Console):
         self.quiet = True
 
 
+class _Instructed(Progress):
+    """Bars under a line that says how to turn the fixture."""
+
+    instruction = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        if self.instruction:
+            yield Text(self.instruction, style="bold")
+        yield from super().get_renderables()
+
+
 SHOW_CURSOR = "\x1b[?25h"
 
 
@@ -232,7 +245,7 @@ class Bars:
 
     def __init__(self) -> None:
         self._console = _Shown(stderr=True)
-        self._progress = Progress(
+        self._progress = _Instructed(
             TextColumn("{task.fields[unit]:<8}", markup=False),
             BarColumn(bar_width=26),
             TextColumn("{task.completed:.0f}/{task.total:.0f} poses"),
@@ -274,12 +287,22 @@ class Bars:
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
-        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(f"{what}: {guide.hint}"))
+        turn = guide.hint.startswith("next")
+        # A unit on a fixture is turned by the fixture's instruction, not by its own.
+        hint = "" if turn and self._progress.instruction else f": {guide.hint}"
+        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(what + hint))
         # Seconds that go by are for a terminal; a log gets a line for each
         # pose, and where to turn next.
         if not guide.hint.startswith("hold still"):
-            hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
-            self._plain(unit, f"{what}: {guide.found} of {guide.wanted} directions{hint}")
+            then = f"; {guide.hint}" if turn and hint else ""
+            self._plain(unit, f"{what}: {guide.found} of {guide.wanted} directions{then}")
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        if instruction is None:
+            self._progress.instruction = ""
+            return
+        self._progress.instruction = printable(f"{instruction.label} ({', '.join(instruction.slots)})")
+        self._plain("the fixture", instruction.label)
 
     def _show(self, unit: str, **values: Any) -> None:
         with suppress(OSError):  # the terminal has gone; the work goes on

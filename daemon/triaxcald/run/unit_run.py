@@ -48,12 +48,14 @@ from triaxcald.report.page import unit_report
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.session import UnitSession
 from triaxcald.run.together import side_by_side
+from triaxcald.run.tray_progress import TrayProgress
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.software import software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
+from triaxcald.station.tray import Tray
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
@@ -94,7 +96,7 @@ class UnitRun(UnitSession):
 
     ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
     the active units of the station. ``rezero`` is a calibration whose biases alone
-    are renewed.
+    are renewed. ``tray`` is that of units which are turned together.
     """
 
     def __init__(
@@ -108,9 +110,10 @@ class UnitRun(UnitSession):
         force: str | None = None,
         others: ActiveUnits | None = None,
         rezero: EarlierFile | None = None,
+        tray: Tray | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
-        self.rezero = rezero
+        self.rezero, self.tray = rezero, tray
         self.others, self.force = others or ActiveUnits(1), force
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
@@ -397,6 +400,12 @@ class UnitRun(UnitSession):
         plan, targets = self.station.file.plan, None
         if self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
+        if self.tray is not None:
+            targets = (
+                self.tray.targets(self.name, targets or tc.planning.directions(wanted))
+                if apart_from is None
+                else self.tray.check_targets(self.name, wanted, apart_from)
+            )
         await collection.until_posed(
             device,
             writer,
@@ -446,10 +455,12 @@ async def run_station(
     in order; the outcomes then have exit code 130.
     """
     serials, others = SerialsSeen(), ActiveUnits(len(station.places))
+    tray = _tray_of(station)
+    shown = None if tray is None else TrayProgress(progress, tray)
     runs = [
         UnitRun(
-            station, place, progress,
-            serials=serials, force=force, others=others, rezero=(rezero or {}).get(place.unit.name),
+            station, place, shown or progress,
+            serials=serials, force=force, others=others, rezero=(rezero or {}).get(place.unit.name), tray=tray,
         )
         for place in station.places
     ]  # fmt: skip
@@ -459,6 +470,8 @@ async def run_station(
             outcome = await run.run()
         finally:
             others.leave()
+            if shown is not None:
+                shown.ended(run.name)
         ended(outcome)
         return outcome
 
@@ -466,3 +479,12 @@ async def run_station(
         for run in runs:
             stack.enter_context(at_abort(run.abort_notice))
         return await side_by_side(map(work, runs))
+
+
+def _tray_of(station: Station) -> Tray | None:
+    """The tray of a station whose units are turned together."""
+    file = station.file
+    if not file.fixture.together:
+        return None
+    mountings = {place.unit.name: place.unit.mounting for place in station.places}
+    return Tray(mountings, file.fixture.names, hold_s=file.plan.hold_s, apart_deg=file.plan.apart_deg)

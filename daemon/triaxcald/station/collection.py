@@ -21,6 +21,7 @@ from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
 from triaxcald.station.reconnect import Streaming
+from triaxcald.station.tray import Instruction
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """Shortest time between two evaluations of the poses, by the samples' time and by the
@@ -46,6 +47,9 @@ class Progress(Protocol):
     def stage(self, unit: str, text: str) -> None: ...
     def lost(self, unit: str, trouble: str) -> None: ...
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
+    def instruction(self, instruction: Instruction | None) -> None:
+        """The next pose of the fixture that turns all units; None if no unit lacks
+        one."""
 
 
 @dataclass
