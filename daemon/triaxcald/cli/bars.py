@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
+from rich.text import Text
 
 from triaxcald.abort import add_action, discard_action, steer
 from triaxcald.cli.console import say
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from triaxcald.run.unit_run import Outcome
     from triaxcald.schema.codes import Code, Stage
     from triaxcald.station.guidance import Guide
+    from triaxcald.station.tray import Instruction
 
 NARROW = 60
 """Columns below which a row has no room for what the operator is to do."""
@@ -35,6 +37,17 @@ class _Shown(Console):
         self.quiet = True
 
 
+class _Instructed(Progress):
+    """Rows under a line that says how to turn the fixture."""
+
+    instruction = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        if self.instruction:
+            yield Text(self.instruction, style="bold", no_wrap=True, overflow="ellipsis")
+        yield from super().get_renderables()
+
+
 class Bars:
     """A row for each slot, in the order of the station file, with the state of its
     unit. Plain lines without a terminal, in a narrow one, and with NO_COLOR."""
@@ -43,7 +56,7 @@ class Bars:
         self._console = _Shown(stderr=True)
         self._live = self._console.is_terminal and self._console.width >= NARROW and not os.environ.get("NO_COLOR")
         wide = self._console.width >= 100
-        self._progress = Progress(
+        self._progress = _Instructed(
             TextColumn("{task.fields[unit]}", markup=False, table_column=Column(no_wrap=True, max_width=16)),
             BarColumn(bar_width=20 if wide else 8),
             TextColumn("{task.completed:.0f}/{task.total:.0f} poses", table_column=Column(no_wrap=True)),
@@ -96,12 +109,22 @@ class Bars:
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
-        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(f"{what}: {guide.text}"))
+        # A unit on a fixture is turned by the fixture's instruction, not by its own.
+        own = guide.next is None or guide.too_short or not self._progress.instruction
+        state = f"{what}: {guide.text}" if own else what
+        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(state))
         # Seconds that go by are for a terminal; a log gets a line for each
         # pose, and where to turn next.
         if not guide.too_short:
-            following = "" if guide.next is None else f"; {guide.text}"
+            following = "" if guide.next is None or not own else f"; {guide.text}"
             self._plain(unit, f"{what}: {guide.found} of {guide.wanted} directions{following}")
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        if instruction is None:
+            self._progress.instruction = ""
+            return
+        self._progress.instruction = printable(f"{instruction.label} ({', '.join(instruction.slots)})")
+        self._plain("the fixture", instruction.label)
 
     def ended(self, outcome: Outcome) -> None:
         """Show the verdict of a unit: its row keeps it, and a line has the reason."""

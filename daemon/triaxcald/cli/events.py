@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from triaxcald.schema.codes import Code
     from triaxcald.station.collection import Progress
     from triaxcald.station.guidance import Guide
+    from triaxcald.station.tray import Instruction
 
 DRAIN_S = 5.0
 """Longest wait at the end for a reader that does not read."""
@@ -85,6 +86,17 @@ class EventLines:
             self._latest[unit] = event
             self._say("poses", unit, **event)
 
+    def instruction(self, instruction: Instruction | None) -> None:
+        if instruction is not None:
+            self._say(
+                "instruction",
+                None,
+                label=instruction.label,
+                face=instruction.face,
+                vector=[round(v, 6) for v in instruction.vector],
+                slots=list(instruction.slots),
+            )
+
     def ended(self, outcome: Outcome) -> None:
         self._say("ended", outcome.unit, outcome=outcome.document)
 
@@ -143,3 +155,7 @@ class Several:
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         for receiver in self._receivers:
             receiver.poses(unit, phase, guide)
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        for receiver in self._receivers:
+            receiver.instruction(instruction)

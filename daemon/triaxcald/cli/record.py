@@ -34,6 +34,7 @@ from triaxcald.schema.codes import Code, Stage
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.config import Place, Station, changed, check_lines, load_station
 from triaxcald.station.guidance import Guide
+from triaxcald.station.tray import Instruction
 
 if TYPE_CHECKING:
     from triaxcald.run.recording import AtRecording, Kept, Roster
@@ -70,6 +71,10 @@ class JsonLines:
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         self.say("info", "poses", unit=unit, phase=phase, found=guide.found, wanted=guide.wanted, message=guide.text)
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        if instruction is not None:
+            self.say("info", "instruction", slots=instruction.slots, message=instruction.label)
 
     def say(self, level: str, event: str, **more: Any) -> None:
         """Nowhere, where nobody reads any more: no work may fail for it."""

@@ -53,6 +53,7 @@ from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.session import UnitSession, stamp
 from triaxcald.run.together import side_by_side
+from triaxcald.run.tray_progress import TrayProgress
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.schema.codes import Stage
 from triaxcald.software import new_run_id, software
@@ -60,6 +61,7 @@ from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
+from triaxcald.station.tray import Tray
 from triaxcald.verification import Verification, fitted_attitudes
 from triaxcald.work import RECORD as WORK_RECORD
 from triaxcald.work import Attempt, Work
@@ -102,6 +104,7 @@ class UnitRun(UnitSession):
     the active units of the station. ``rezero`` is a calibration whose biases alone
     are renewed. ``work`` is what the unit is measured for, ``attempts`` the tray that
     the run belongs to; by default it is a tray of its own. ``id`` is the id of the run.
+    ``tray`` is that of units which are turned together.
     """
 
     def __init__(
@@ -117,9 +120,10 @@ class UnitRun(UnitSession):
         rezero: EarlierFile | None = None,
         work: Work | None = None,
         attempts: Attempts | None = None,
+        tray: Tray | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
-        self.rezero = rezero
+        self.rezero, self.tray = rezero, tray
         self.others, self.force = others or ActiveUnits(1), force
         self.id = new_run_id(clock_ns())
         self.stopped_for: str | None = None
@@ -497,6 +501,12 @@ class UnitRun(UnitSession):
         plan, targets = self.station.file.plan, None
         if self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
+        if self.tray is not None:
+            targets = (
+                self.tray.targets(self.name, targets or tc.planning.directions(wanted))
+                if apart_from is None
+                else self.tray.check_targets(self.name, wanted, apart_from)
+            )
         await collection.until_posed(
             device,
             writer,
@@ -575,12 +585,14 @@ class TrayRun:
         self._station, self._ended, self._killed, self._begun = station, ended, killed, begun
         self._serials, self._others = SerialsSeen(), ActiveUnits(len(station.places))
         self._attempts = Attempts(station.folder, self.id, station.file.name)
+        tray = _tray_of(station)
+        self._shown = None if tray is None else TrayProgress(progress, tray)
         self._runs = [
             UnitRun(
-                station, place, progress,
+                station, place, self._shown or progress,
                 serials=self._serials, force=force, others=self._others,
                 rezero=(rezero or {}).get(place.unit.name), work=(work or {}).get(place.unit.name),
-                attempts=self._attempts,
+                attempts=self._attempts, tray=tray,
             )
             for place in station.places
         ]  # fmt: skip
@@ -617,6 +629,8 @@ class TrayRun:
             outcome = await run.run()
         finally:
             self._others.leave()
+            if self._shown is not None:
+                self._shown.ended(run.name)
         self._ended(outcome)
         return outcome
 
@@ -628,3 +642,12 @@ def run_station(station: Station, progress: Progress, **settings: Any) -> TrayRu
     ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
     maps it to what it is measured for."""
     return TrayRun(station, progress, **settings)
+
+
+def _tray_of(station: Station) -> Tray | None:
+    """The tray of a station whose units are turned together."""
+    file = station.file
+    if not file.fixture.together:
+        return None
+    mountings = {place.unit.name: place.unit.mounting for place in station.places}
+    return Tray(mountings, file.fixture.names, hold_s=file.plan.hold_s, apart_deg=file.plan.apart_deg)

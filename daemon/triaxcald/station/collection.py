@@ -22,6 +22,7 @@ from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
 from triaxcald.station.reconnect import Streaming
+from triaxcald.station.tray import Instruction
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """Shortest time between two evaluations of the poses, by the samples' time and by the
@@ -58,6 +59,10 @@ class Progress(Protocol):
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         """State of a pose acquisition, several times a second."""
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        """The next pose of the fixture that turns all units; None if no unit lacks
+        one."""
 
 
 @dataclass

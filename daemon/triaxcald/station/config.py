@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -13,13 +14,15 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
 import triaxcal as tc
 import triaxcal_drivers as td
+from triaxcald import work
 from triaxcald.errors import InputError, SerialTwice
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
+from triaxcald.station.faces import AXES, OWN_NAMES, rotation
 from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
@@ -68,6 +71,96 @@ class Provisioning(td.Strict):
     ] = False
 
 
+def _mounting(text: str) -> str:
+    rotation(text)
+    return text
+
+
+FACE_MOST = 24
+"""Characters of a face's name: a corner with three of them still fits a line of 80."""
+
+
+class Fixture(td.Strict):
+    together: Annotated[
+        bool, Field(description="all units are turned together, by one instruction for the whole fixture")
+    ] = False
+    faces: dict[str, str] = Field(
+        default_factory=dict, description="names of the fixture's faces by its axes, +x to -z"
+    )
+
+    @field_validator("faces")
+    @classmethod
+    def _faces_differ(cls, faces: dict[str, str]) -> dict[str, str]:
+        for axis, name in faces.items():
+            if axis not in AXES:
+                raise ValueError(f"unknown axis '{axis}', expected {', '.join(AXES)}")
+            if not 1 <= len(name) <= FACE_MOST or not name.isprintable():
+                raise ValueError(f"{axis}: expected a name of 1 to {FACE_MOST} printable characters")
+        names = list({**OWN_NAMES, **faces}.values())
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two faces have the name '{name}'; a face that is not given has that of its axis")
+        return faces
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Name of each face by its axis."""
+        return {**OWN_NAMES, **self.faces}
+
+
+def _work_text(text: str) -> str:
+    if why := work.wrong(text):
+        raise ValueError(why.removesuffix(f", not {len(text)}"))  # the message quotes the text itself
+    return text
+
+
+WorkText = Annotated[str, AfterValidator(_work_text)]
+
+
+class Golden(td.Strict):
+    """A unit that is measured from time to time to check the station itself."""
+
+    serial: WorkText
+    every_h: Annotated[float, Field(gt=0, description="it is due so long after it was last measured")]
+    calibration: Annotated[
+        PathText, Field(description="the calibration that it is known to have, beside the station file")
+    ]
+
+
+class Rules(td.Strict):
+    """Conditions under which a run may begin."""
+
+    serial: Annotated[
+        str | None, Field(description="regular expression that every serial number matches as a whole")
+    ] = None
+    attempts: Annotated[int | None, Field(ge=1, description="most attempts at one serial number")] = None
+    operator: Annotated[bool, Field(description="nothing begins without an operator")] = False
+    retest_reason: Annotated[bool, Field(description="a re-test after a pass needs a reason")] = False
+    open_loopback: Annotated[bool, Field(description="requests from this machine need no session of an operator")] = (
+        False
+    )
+    golden: Golden | None = None
+
+    @field_validator("serial")
+    @classmethod
+    def _compiles(cls, text: str | None) -> str | None:
+        try:
+            re.compile(text or "")
+        except (re.error, OverflowError, RecursionError) as e:
+            raise ValueError(f"expected a regular expression: {e}") from None
+        return text
+
+
+class WorkDefaults(td.Strict):
+    """What units are measured for, where the command line does not say."""
+
+    operator: WorkText | None = None
+    order: WorkText | None = None
+    batch: WorkText | None = None
+    part_number: WorkText | None = None
+    fixture: WorkText | None = None
+
+
 class Unit(td.Strict):
     name: Annotated[str, Field(pattern=NAME)]
     profile: Annotated[
@@ -79,6 +172,11 @@ class Unit(td.Strict):
         tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None,
         Field(description="of the scale factors; by default the profile's"),
     ] = None
+    mounting: Annotated[
+        str,
+        AfterValidator(_mounting),
+        Field(description="the fixture's axes along which the unit's x, y, and z point"),
+    ] = "+x+y+z"
     bus: dict[str, Any]
 
 
@@ -118,6 +216,9 @@ class StationFile(td.Strict):
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
+    fixture: Fixture = Fixture()
+    rules: Rules = Rules()
+    work: WorkDefaults = WorkDefaults()
     buses: Annotated[
         tuple[Bus, ...],
         Field(max_length=BUSES_MOST, description="listened to by `record`: all their frames"),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import triaxcal as tc
+from triaxcald.station.faces import described
 
 COVERED_DEG = 25.0
 """Largest angle between a pose and the direction of the plan that it covers."""
@@ -27,13 +28,10 @@ class NextPose:
     once_more: bool = False
 
     def __str__(self) -> str:
-        """The axes that point up; the components of a direction that only a number
-        names."""
-        if self.label.startswith(("+", "-")):
-            up = f"{self.label} up"
-        else:
-            x, y, z = self.vector
-            up = f"{self.label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+        """The axes that point up; of a direction that only a number names also its
+        description."""
+        numbered = not self.label.startswith(("+", "-"))
+        up = f"{self.label} ({described(np.array(self.vector))})" if numbered else f"{self.label} up"
         return f"{up} once more: the first pose again shows drift" if self.once_more else up
 
 
@@ -47,7 +45,8 @@ class Guide:
     taken yet will do. ``too_short``: the present pose has to be held longer.
 
     ``missing`` are the labels of the uncovered poses of the plan, in its order.
-    ``repeat_due``: the first pose is wanted once more, after all others.
+    ``repeat_due``: the first pose is wanted once more, after all others. ``at`` is the
+    label of the present pose in the plan, None during a motion and off the plan.
     ``counted_s`` are times inside the poses that were long enough, for the next
     evaluation.
     """
@@ -60,6 +59,7 @@ class Guide:
     too_short: bool = False
     missing: tuple[str, ...] = ()
     repeat_due: bool = False
+    at: str | None = None
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
     """Whether poses keep coming in unwanted directions, so that they must suffice."""
@@ -133,8 +133,10 @@ def guide(
         targets = (
             tc.planning.directions(wanted) if plan else tc.planning.elsewhere(np.array(taken), wanted) if taken else []
         )
-    missing = _uncovered(targets, held) if found < wanted else ()
+    # A pose that does not count may cover a direction; at last that is wanted again.
+    missing = (_uncovered(targets, held) or _uncovered(targets, distinct)) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
+    at = next(iter(_covered(targets, up[-1:])), None) if still_s else None
     following = None
     if due:
         following = _again(targets, distinct[0])
@@ -142,7 +144,7 @@ def guide(
         following = _pose_of(*next(target for target in targets if target[0] == missing[0]))
     too_short = 0 < still_s < hold_s and not enough[-1]
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
-    return Guide(found, wanted, still_s, hold_s, following, too_short, missing, due, middles, only_near)
+    return Guide(found, wanted, still_s, hold_s, following, too_short, missing, due, at, middles, only_near)
 
 
 def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
@@ -150,13 +152,19 @@ def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
 
 
 def _uncovered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats]) -> tuple[str, ...]:
-    if not targets or not held:
-        return tuple(label for label, _ in targets)
+    covered = _covered(targets, held)
+    return tuple(label for label, _ in targets if label not in covered)
+
+
+def _covered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats] | tc.Floats) -> set[str]:
+    """Labels of the directions that the poses ``held`` are nearest to, and near
+    enough."""
+    if not targets or not len(held):
+        return set()
     cosines = np.array(held) @ np.array([v for _, v in targets]).T
     nearest = np.argmax(cosines, axis=1)
     close = cosines[np.arange(len(held)), nearest] >= np.cos(np.radians(COVERED_DEG))
-    covered = set(nearest[close].tolist())
-    return tuple(label for i, (label, _) in enumerate(targets) if i not in covered)
+    return {targets[i][0] for i in nearest[close]}
 
 
 def _pose_of(label: str, v: tc.Floats, *, once_more: bool = False) -> NextPose:

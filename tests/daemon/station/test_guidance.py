@@ -10,6 +10,7 @@ import pytest
 
 from triaxcal.model.directions import directions, elsewhere
 from triaxcal.poses.pose import Pose
+from triaxcald.station.faces import described
 from triaxcald.station.guidance import Guide, guide
 
 PLAN = directions(14)
@@ -34,10 +35,10 @@ def test_at_first_the_first_pose_of_the_plan_is_next() -> None:
     assert list(state.missing) == LABELS
 
 
-def test_a_direction_that_only_a_number_names_is_told_by_its_components() -> None:
-    label, (x, y, z) = directions(20)[0]
+def test_a_direction_that_only_a_number_names_is_told_by_the_axes_near_it() -> None:
+    label, up = directions(20)[0]
     assert label.startswith("N")
-    assert _guide([], wanted=20).text == f"next: {label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+    assert _guide([], wanted=20).text == f"next: {label} ({described(up)})"
 
 
 def test_a_pose_that_is_there_is_not_asked_for_again() -> None:
@@ -116,6 +117,36 @@ def test_in_a_dense_plan_a_pose_covers_the_direction_that_it_is_nearest_to_alone
     plan = directions(60)
     state = _guide([_pose(plan[10][1])], wanted=60)
     assert [label for label, _ in plan if label not in state.missing] == [plan[10][0]]
+
+
+def test_a_direction_that_only_uncounted_poses_cover_is_wanted_at_last() -> None:
+    """The fixture still stands in an attitude of the fit, near a direction to check in."""
+    fitted = np.array([v for _, v in directions(26)])
+    targets = elsewhere(fitted, 3)
+    labels = [label for label, _ in targets]
+    standing = _pose(fitted[np.argmax(fitted @ targets[0][1])])
+    settings = {"plan": False, "wanted": 3, "apart_from": fitted, "targets": targets}
+    assert _guide([standing], **settings).missing == tuple(labels[1:])
+    rest = [_pose(v, 10.0 + 5 * i) for i, (_, v) in enumerate(targets[1:])]
+    state = _guide([standing, *rest], **settings)
+    assert (state.found, state.missing, state.complete) == (2, (labels[0],), False)
+    assert _guide([standing, *rest, _pose(targets[0][1], 50.0)], **settings).complete
+
+
+def _turned(a: Any, b: Any, degrees: float) -> np.ndarray:
+    """From one axis towards another."""
+    angle = np.radians(degrees)
+    return np.asarray(np.cos(angle) * a + np.sin(angle) * b)
+
+
+def test_the_place_of_the_present_pose_and_of_the_repeat_are_told_by_their_labels() -> None:
+    taken = [_pose(u, 5.0 * i) for i, u in enumerate([UP[3], *UP[:3], *UP[4:]])]
+    due = _guide(taken, repeat=True, now_s=69.2)
+    assert (due.repeat, due.at) == (LABELS[3], LABELS[-1])
+    moving = _guide(taken[:-1], repeat=True, now_s=68.0)
+    assert (moving.repeat, moving.at) == (None, None)
+    off = _guide([_pose(_turned(UP[LABELS.index("+X")], UP[LABELS.index("+Y")], 27))], now_s=4.1)
+    assert (off.found, off.at) == (1, None)
 
 
 def test_without_a_plan_any_pose_will_do() -> None:

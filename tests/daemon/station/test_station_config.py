@@ -122,6 +122,102 @@ def test_a_fault_is_said_with_file_line_and_field(tmp_path: Path, old: str, new:
     assert "triax-ref-cna" in message or message.startswith(str(path))
 
 
+TRAY = """\
+
+[fixture]
+together = true
+faces = { "+x" = "A", "-z" = "lid" }
+
+[rules]
+serial = "[0-9]{4}"
+attempts = 3
+golden = { serial = "0001", every_h = 24, calibration = "golden.json" }
+
+[work]
+operator = "Ada"
+order = "WO-7"
+"""
+
+
+def _tray(tmp_path: Path, old: str = "", new: str = "") -> Path:
+    text = GOOD.replace('serial = "4711"', 'serial = "4711"\nmounting = "-y+x+z"').replace(
+        "[[units]]", f"{TRAY}\n[[units]]", 1
+    )
+    assert old in text
+    path = tmp_path / "station.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+def test_a_station_without_a_fixture_turns_each_unit_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD)
+    file = load_station(path).file
+    assert not file.fixture.together
+    assert [unit.mounting for unit in file.units] == ["+x+y+z"] * 2
+    assert file.fixture.names == {a: a.upper() for a in ("+x", "-x", "+y", "-y", "+z", "-z")}
+    assert file.rules.model_dump() == {
+        "serial": None, "attempts": None, "operator": False, "retest_reason": False, "open_loopback": False,
+        "golden": None,
+    }  # fmt: skip
+    assert set(file.work.model_dump().values()) == {None}
+
+
+def test_fixture_rules_and_work_are_read(tmp_path: Path) -> None:
+    file = load_station(_tray(tmp_path)).file
+    assert file.fixture.together
+    assert file.fixture.names == {"+x": "A", "-x": "-X", "+y": "+Y", "-y": "-Y", "+z": "+Z", "-z": "lid"}
+    assert [unit.mounting for unit in file.units] == ["-y+x+z", "+x+y+z"]
+    assert (file.rules.serial, file.rules.attempts) == ("[0-9]{4}", 3)
+    assert file.rules.golden is not None
+    assert (file.rules.golden.serial, file.rules.golden.every_h, file.rules.golden.calibration) == (
+        "0001", 24, "golden.json",
+    )  # fmt: skip
+    assert (file.work.operator, file.work.order, file.work.batch) == ("Ada", "WO-7", None)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("together = true", "together = 1", "line 13: fixture.together: input should be a valid boolean, not 1"),
+        ("together = true", "togethr = true", "line 13: fixture.togethr: unknown key; did you mean 'together'?"),
+        ('"+x" = "A"', '"+w" = "A"', "line 14: fixture.faces: unknown axis '+w', expected +x, -x, +y, -y, +z, -z"),
+        ('"+x" = "A"', '"+X" = "A"', "line 14: fixture.faces: unknown axis '+X', "),
+        ('"+x" = "A"', '"+x" = "lid"', "line 14: fixture.faces: two faces have the name 'lid'"),
+        ('"+x" = "A"', '"+x" = "-Y"', "line 14: fixture.faces: two faces have the name '-Y'"),
+        ('"+x" = "A"', '"+x" = ""', "line 14: fixture.faces: +x: expected a name of 1 to 24 printable characters"),
+        ('"+x" = "A"', f'"+x" = "{25 * "A"}"', "line 14: fixture.faces: +x: expected a name of 1 to 24 printable"),
+        ('"+x" = "A"', '"+x" = "A\\u001b"', "line 14: fixture.faces: +x: expected a name of 1 to 24 printable"),
+        ('"+x" = "A"', '"+x" = 1', "line 14: fixture.faces.+x: input should be a valid string, not 1"),
+        ('"-y+x+z"', '"+x-y+z"', "line 29: units.0.mounting: a mirror image, no rotation"),
+        ('"-y+x+z"', '"+x+x+z"', "line 29: units.0.mounting: the fixture's x axis is given twice"),
+        ('"-y+x+z"', '"xyz"', "line 29: units.0.mounting: expected three axes of the fixture"),
+        ('"-y+x+z"', "1", "line 29: units.0.mounting: input should be a valid string, not 1"),
+        ("[0-9]{4}", "[0-9", "line 17: rules.serial: expected a regular expression: unterminated character set"),
+        ("attempts = 3", "attempts = 0", "line 18: rules.attempts: input should be greater than or equal to 1, not 0"),
+        ("attempts = 3", 'operator = "yes"', "line 18: rules.operator: input should be a valid boolean, not 'yes'"),
+        ("attempts = 3", "retest_reason = 1", "line 18: rules.retest_reason: input should be a valid boolean"),
+        ("attempts = 3", "open_loopback = 1", "line 18: rules.open_loopback: input should be a valid boolean"),
+        ("every_h = 24", "every_h = 0", "line 19: rules.golden.every_h: input should be greater than 0, not 0"),
+        ('serial = "0001"', 'serial = ""', "line 19: rules.golden.serial: expected 1 to 64 characters, not ''"),
+        (', calibration = "golden.json"', "", "line 19: rules.golden.calibration: missing"),
+        ('"Ada"', '""', "line 22: work.operator: expected 1 to 64 characters, not ''"),
+        ('"Ada"', f'"{65 * "a"}"', "line 22: work.operator: expected 1 to 64 characters, not 'aaaa"),
+        ('"Ada"', '"A\\u0007da"', "line 22: work.operator: expected printable characters alone"),
+        ("order =", "slot =", "line 23: work.slot: unknown key"),
+    ],
+)
+def test_a_fault_of_fixture_rules_or_work_is_said_with_file_line_and_key(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    path = _tray(tmp_path, old, new)
+    with pytest.raises((InputError, DriverError)) as caught:
+        load_station(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}, {words}")
+    assert "\n" not in message
+
+
 TCP = {"host": "127.0.0.1", "port": 1502}
 RTU = {"serial_port": "/dev/ttyUSB0", "baudrate": 115200, "parity": "N"}
 
