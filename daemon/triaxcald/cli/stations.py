@@ -35,6 +35,11 @@ def run_command(a: argparse.Namespace) -> int:
         raise InputError("--events: standard output has one JSON object a line, or with --json one document; give one")
     station = load_station(a.station)
     station.require_units()
+    from triaxcald.run.orders import with_serials, works
+
+    station = with_serials(station, a.serial)
+    given = {key: getattr(a, key) for key in ("operator", "order", "batch", "part_number", "fixture", "reason")}
+    work = works(station, given)
     rezero = {}
     if a.rezero:
         from triaxcald.earlier import earlier_by_unit
@@ -58,7 +63,7 @@ def run_command(a: argparse.Namespace) -> int:
                 events.begun()
 
         tray = run_station(
-            station, Several(receivers), force=a.force, rezero=rezero,
+            station, Several(receivers), force=a.force, rezero=rezero, work=work,
             ended=ended, killed=lambda killed: say(killed.line), begun=begun,
         )  # fmt: skip
         if a.events:

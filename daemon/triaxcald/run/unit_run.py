@@ -51,6 +51,7 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
+from triaxcald.run.orders import require_allowed, require_serial
 from triaxcald.run.session import UnitSession, stamp
 from triaxcald.run.together import side_by_side
 from triaxcald.run.tray_progress import TrayProgress
@@ -217,11 +218,16 @@ class UnitRun(UnitSession):
         return ending
 
     async def _identified(self, identity: IdentityRead) -> None:
-        """Note the serial number, and count the attempts at it. Raises DiskError."""
+        """Note the serial number, and count the attempts at it. Raises InputError if
+        the rules of the station forbid another."""
         self._serial = identity.serial
         work = self._attempt.work
         self._history = await asyncio.to_thread(History.of, self.station.folder, identity.serial or work.serial)
         attempt = None if (identity.serial or work.serial) is None else self._history.attempts + 1
+        if work.serial is None and identity.serial is not None:  # else it was checked before the start
+            rules = self.station.file.rules
+            require_serial(rules, identity.serial, self.name)
+            require_allowed(rules, work, identity.serial, self._history)
         self._attempt = replace(self._attempt, work=replace(work, attempt=attempt))
 
     async def _recorded_to(self, path: Path) -> None:

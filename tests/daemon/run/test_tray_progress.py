@@ -6,6 +6,7 @@ from typing import Any
 
 from triaxcal.model.directions import directions
 from triaxcald.run.tray_progress import TrayProgress
+from triaxcald.schema.codes import Code, Stage
 from triaxcald.station.faces import OWN_NAMES
 from triaxcald.station.guidance import Guide
 from triaxcald.station.tray import Instruction, Tray
@@ -18,10 +19,10 @@ class Shown:
     def __init__(self) -> None:
         self.told: list[Any] = []
 
-    def stage(self, unit: str, text: str) -> None:
-        self.told.append((unit, text))
+    def stage(self, unit: str, stage: Stage) -> None:
+        self.told.append((unit, stage.value))
 
-    def lost(self, unit: str, trouble: str) -> None:
+    def lost(self, unit: str, code: Code, trouble: str) -> None:
         self.told.append((unit, "lost", trouble))
 
     def poses(self, unit: str, phase: str, guide: Guide) -> None:
@@ -37,13 +38,13 @@ def test_an_instruction_is_told_before_the_poses_that_changed_it_and_once() -> N
     progress = TrayProgress(shown, tray)
     for slot in "ab":
         tray.targets(slot, PLAN)
-    progress.stage("a", "poses")
-    progress.poses("a", "calibration", Guide(0, 14, 0.0, "", tuple(LABELS)))
-    progress.poses("b", "calibration", Guide(0, 14, 0.0, "", tuple(LABELS)))
-    progress.poses("a", "calibration", Guide(1, 14, 0.0, "", tuple(LABELS[1:])))
-    progress.lost("b", "nothing answers")
-    progress.poses("a", "calibration", Guide(14, 14, 0.0, ""))
-    progress.poses("b", "calibration", Guide(0, 14, 0.0, "", tuple(LABELS)))
+    progress.stage("a", Stage.POSES)
+    progress.poses("a", "calibration", Guide(0, 14, 0.0, 3.0, missing=tuple(LABELS)))
+    progress.poses("b", "calibration", Guide(0, 14, 0.0, 3.0, missing=tuple(LABELS)))
+    progress.poses("a", "calibration", Guide(1, 14, 0.0, 3.0, missing=tuple(LABELS[1:])))
+    progress.lost("b", Code.LOST, "nothing answers")
+    progress.poses("a", "calibration", Guide(14, 14, 0.0, 3.0))
+    progress.poses("b", "calibration", Guide(0, 14, 0.0, 3.0, missing=tuple(LABELS)))
     progress.ended("b")
     progress.ended("a")
     assert shown.told == [

@@ -142,9 +142,11 @@ def _turned(a: Any, b: Any, degrees: float) -> np.ndarray:
 def test_the_place_of_the_present_pose_and_of_the_repeat_are_told_by_their_labels() -> None:
     taken = [_pose(u, 5.0 * i) for i, u in enumerate([UP[3], *UP[:3], *UP[4:]])]
     due = _guide(taken, repeat=True, now_s=69.2)
-    assert (due.repeat, due.at) == (LABELS[3], LABELS[-1])
+    assert due.next is not None
+    assert (due.next.label, due.next.once_more, due.at) == (LABELS[3], True, LABELS[-1])
     moving = _guide(taken[:-1], repeat=True, now_s=68.0)
-    assert (moving.repeat, moving.at) == (None, None)
+    assert moving.next is not None
+    assert (moving.next.once_more, moving.at) == (False, None)
     off = _guide([_pose(_turned(UP[LABELS.index("+X")], UP[LABELS.index("+Y")], 27))], now_s=4.1)
     assert (off.found, off.at) == (1, None)
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from triaxcal.model.bias_directions import bias_directions
 
-from triaxcal.model.directions import directions, elsewhere
+from triaxcal.model.directions import bias_directions, directions, elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcald.station.faces import OWN_NAMES, described, rotation
-from triaxcald.station.guidance import COVERED_DEG, Guide, guide
+from triaxcald.station.guidance import COVERED_DEG, Guide, NextPose, guide
 from triaxcald.station.tray import WAIT_HOLDS, WAIT_S, Instruction, Tray
 
 HOLD_S, APART_DEG, LOOK_S, TURN_S = 3.0, 10.0, 1.0, 1.5
@@ -308,7 +307,7 @@ def _tray(**slots: str) -> Tray:
 
 def _report(tray: Tray, slot: str, *, lacks: Sequence[str], at: str | None = None, held_s: float = 0.0) -> Any:
     """By slots that sit as the fixture does, so that labels are the fixture's."""
-    return tray.poses(slot, Guide(14 - len(lacks), 14, held_s, "", tuple(lacks), at=at))
+    return tray.poses(slot, Guide(14 - len(lacks), 14, held_s, 3.0, missing=tuple(lacks), at=at))
 
 
 LABELS = [label for label, _ in PLAN]
@@ -381,10 +380,10 @@ def test_a_repeat_goes_after_new_poses_that_as_many_lack() -> None:
     for slot in "ab":
         _report(tray, slot, lacks=LABELS[3:])
     _report(tray, "b", lacks=[last])
-    told = tray.poses("a", Guide(14, 14, 0.0, "", (), repeat_due=True, repeat="+X"))
+    told = tray.poses("a", Guide(14, 14, 0.0, 3.0, NextPose("+X", (1.0, 0.0, 0.0), once_more=True), repeat_due=True))
     assert told is not None
     assert told.vector == pytest.approx(dict(PLAN)[last])
-    told = tray.poses("b", Guide(14, 14, 0.0, "", (), repeat_due=True, repeat="+X"))
+    told = tray.poses("b", Guide(14, 14, 0.0, 3.0, NextPose("+X", (1.0, 0.0, 0.0), once_more=True), repeat_due=True))
     assert told is not None
     assert (told.label, told.slots) == ("+X up once more", ("a", "b"))
     assert _report(tray, "b", lacks=["+X"]).label == "+X up"  # new to one of them
@@ -418,11 +417,11 @@ def test_check_poses_are_apart_from_the_units_own_in_its_own_axes(seed: int) -> 
 def test_a_unit_that_has_to_make_do_with_the_fits_attitudes_lacks_no_more() -> None:
     tray = _begun("ab")
     tray.left("b")
-    assert tray.poses("a", Guide(1, 3, 0.0, "done", ("+X", "+Y"), only_near=True)) is None
+    assert tray.poses("a", Guide(1, 3, 0.0, 3.0, missing=("+X", "+Y"), only_near=True)) is None
 
 
 def test_nobody_who_lacks_a_pose_means_no_instruction() -> None:
     tray = _tray()
     assert tray.instruction() is None
     tray.targets("a", PLAN)
-    assert tray.poses("a", Guide(14, 14, 3.0, "done")) is None
+    assert tray.poses("a", Guide(14, 14, 3.0, 3.0)) is None
