@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
+from triaxcald.documents import json_value
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 from triaxcald.schema.codes import Code as Code
@@ -153,7 +153,7 @@ def latest_of(folder: Path, serial: str | None) -> str | None:
     for path in folder.glob(f"*{serial}-*{SUFFIX}"):
         try:
             data = path.read_bytes()
-            held = json.loads(data)
+            held = json_value(data)
         except (OSError, ValueError, RecursionError):  # not one of ours
             continue
         if isinstance(held, dict) and held.get("format") == FORMAT and held.get("serial") == serial:
