@@ -280,40 +280,54 @@ def reliability(lines: Sequence[Line]) -> Table:
 
 
 def paired(old: Sequence[Line], new: Sequence[Line]) -> Table:
-    """Differences of ``new`` from ``old`` over the recordings that both have, with Holm's correction over all rows.
+    """Differences of ``new`` from ``old`` over the recordings that both have, with Holm's correction over all rows."""
+    tested = [row for group, pairs in by_group(old, new).items() for row in differences(*group, pairs)]
+    corrected = holm([p for _, p in tested])
+    rows = [[*row, f"{p:.3f}", f"{q:.3f}"] for (row, p), q in zip(tested, corrected, strict=True)]
+    return Table("Paired differences", ["truth", "poses", "n", "of", "old", "new", "change", "p", "p (Holm)"], rows)
 
-    Names right and wrong: the exact test of McNemar. The error: a paired t-test of log(after / before); a recording
-    that was not corrected has the ratio 1.
-    """
+
+def by_group(old: Sequence[Line], new: Sequence[Line]) -> dict[tuple[str, int], list[tuple[Line, Line]]]:
+    """By section and number of poses: pairs of lines of one recording, without those that ended in an error."""
     known = {(one.section, one.kind, one.seed, one.poses, one.noise): one for one in old if not one.error}
     pairs: dict[tuple[str, int], list[tuple[Line, Line]]] = {}
     for one in new:
         before = known.get((one.section, one.kind, one.seed, one.poses, one.noise))
         if before is not None and not one.error:
             pairs.setdefault((one.section, one.poses), []).append((before, one))
-    found: list[tuple[list[str], float]] = []
-    for (section, poses), group in pairs.items():
-        for what in ("right", "wrong"):
-            gained = sum(getattr(b, what) and not getattr(a, what) for a, b in group)
-            lost = sum(getattr(a, what) and not getattr(b, what) for a, b in group)
-            p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
-            values = [str(sum(getattr(one, what) for one in side)) for side in zip(*group, strict=True)]
-            found.append(([section, str(poses), str(len(group)), f"unique {what}", *values, f"+{gained} −{lost}"], p))
-        logs = np.log([[one.after_g / one.before_g for one in pair] for pair in group])
-        logs = logs[np.isfinite(logs).all(axis=1)]
-        change = logs[:, 1] - logs[:, 0]
-        error = float(change.std(ddof=1) / np.sqrt(len(change)))
-        p = float(ttest_1samp(change, 0.0).pvalue) if error > 0 else 1.0
-        values = [f"{np.exp(v):.3f}" for v in logs.mean(axis=0)]
-        told = f"{change.mean():+.3f} ± {error:.3f}"
-        found.append(([section, str(poses), str(len(change)), "after / before", *values, told], p))
-    # Holm: the k-th smallest of m probabilities is multiplied by m - k, and none is below the one before it.
-    order = np.argsort([p for _, p in found])
-    scaled = np.array([found[i][1] for i in order]) * np.arange(len(found), 0, -1)
-    corrected = np.minimum(np.maximum.accumulate(scaled), 1.0)
-    by_row = dict(zip(order.tolist(), corrected.tolist(), strict=True))
-    rows = [[*row, f"{p:.3f}", f"{by_row[i]:.3f}"] for i, (row, p) in enumerate(found)]
-    return Table("Paired differences", ["truth", "poses", "n", "of", "old", "new", "change", "p", "p (Holm)"], rows)
+    return pairs
+
+
+def differences(section: str, poses: int, pairs: Sequence[tuple[Line, Line]]) -> Iterator[tuple[list[str], float]]:
+    """Rows of a table, each with its p-value.
+
+    Names right and wrong: the exact test of McNemar. The error: a paired t-test of log(after / before); a recording
+    that was not corrected has the ratio 1.
+    """
+    for what in ("right", "wrong"):
+        gained = sum(getattr(b, what) and not getattr(a, what) for a, b in pairs)
+        lost = sum(getattr(a, what) and not getattr(b, what) for a, b in pairs)
+        p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+        values = [str(sum(getattr(one, what) for one in side)) for side in zip(*pairs, strict=True)]
+        yield [section, str(poses), str(len(pairs)), f"unique {what}", *values, f"+{gained} −{lost}"], p
+    logs = np.log([[one.after_g / one.before_g for one in pair] for pair in pairs])
+    logs = logs[np.isfinite(logs).all(axis=1)]
+    change = logs[:, 1] - logs[:, 0]
+    error = float(change.std(ddof=1) / np.sqrt(len(change)))
+    p = float(ttest_1samp(change, 0.0).pvalue) if error > 0 else 1.0
+    values = [f"{np.exp(v):.3f}" for v in logs.mean(axis=0)]
+    told = f"{change.mean():+.3f} ± {error:.3f}"
+    yield [section, str(poses), str(len(change)), "after / before", *values, told], p
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Each p-value corrected for their number m: the k-th smallest, from 0, is multiplied by m - k, and none is below
+    the one before it."""
+    order = np.argsort(p)
+    scaled = np.asarray(p)[order] * np.arange(len(p), 0, -1)
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return corrected.tolist()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

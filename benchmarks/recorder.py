@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import can
 import cantools
@@ -35,6 +36,14 @@ LAST = 0x7FE  # the identifier that ends a reception
 RATE_HZ = 1000  # what a Python sender keeps up with beside four receivers on two processors
 
 
+class Writer(Protocol):
+    """What python-can's loggers and ours have in common."""
+
+    def __call__(self, message: can.Message, /) -> None: ...
+
+    def stop(self) -> None: ...
+
+
 class McapMessageWriter:
     """One MCAP message a frame, as loggers of other fields write them: identifier, flags and data."""
 
@@ -54,7 +63,7 @@ class McapMessageWriter:
         self._file.close()
 
 
-WRITERS: dict[str, tuple[str, Callable[[Path], object]]] = {
+WRITERS: dict[str, tuple[str, Callable[[Path], Writer]]] = {
     "triaxcal, as a plugin of python-can": ("mcap", RecordingMessageWriter),
     "python-can BLF": ("blf", can.BLFWriter),
     "python-can ASC": ("asc", can.ASCWriter),
@@ -80,15 +89,15 @@ def spent_s(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def written(make: Callable[[Path], object], path: Path, messages: Sequence[can.Message]) -> float:
+def written(make: Callable[[Path], Writer], path: Path, messages: Sequence[can.Message]) -> float:
     """Processor seconds."""
     path.unlink(missing_ok=True)
 
     def work() -> None:
         writer = make(path)
         for message in messages:
-            writer(message)  # type: ignore[operator]  # all of them take messages by being called
-        writer.stop()  # type: ignore[attr-defined]
+            writer(message)
+        writer.stop()
 
     return spent_s(work)
 
@@ -117,7 +126,7 @@ def writing(count: int, runs: int, folder: Path) -> Table:
         least[name] = min(least.get(name, np.inf), recorded(path, batches))
         size[name] = path.stat().st_size
         for name, (suffix, make) in WRITERS.items():
-            path = folder / f"{make.__name__}.{suffix}"  # type: ignore[attr-defined]
+            path = folder / f"{make.__name__}.{suffix}"
             least[name] = min(least.get(name, np.inf), written(make, path, messages))
             size[name] = path.stat().st_size
     told = [[n, f"{1e6 * s / count:.2f}", f"{size[n] / count:.1f}"] for n, s in least.items()]
@@ -225,7 +234,7 @@ def _send(count: int, port: int) -> None:
 def receive(name: str, folder: Path, port: int) -> None:
     """What `can_logger` does, and what it cost from the first frame to the end of the file."""
     suffix, make = WRITERS[name]
-    path = folder / f"received-{make.__name__}.{suffix}"  # type: ignore[attr-defined]
+    path = folder / f"received-{make.__name__}.{suffix}"
     with can.Bus(interface="udp_multicast", channel=GROUP, port=port) as bus:
         writer = make(path)
         print("ready", flush=True)
@@ -233,9 +242,9 @@ def receive(name: str, folder: Path, port: int) -> None:
         before = time.process_time()
         got = 0
         for message in messages:
-            writer(message)  # type: ignore[operator]
+            writer(message)
             got += 1
-        writer.stop()  # type: ignore[attr-defined]
+        writer.stop()
         print(got, time.process_time() - before, path.stat().st_size)
 
 

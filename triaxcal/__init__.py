@@ -12,8 +12,9 @@ Everything is loaded when it is first asked for.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal import (
@@ -86,7 +87,7 @@ _ROOMS = (
     "units",
 )
 _NAMES = {
-    "triaxcal.api": (
+    "api": (
         "Diagnosis",
         "PlannedPose",
         "Poses",
@@ -99,35 +100,34 @@ _NAMES = {
         "rezero",
         "verify",
     ),
-    "triaxcal.arrays": (
+    "arrays": (
         "Floats",
         "Ints",
     ),
-    "triaxcal.documents": ("Calibration",),
-    "triaxcal.errors": (
+    "documents": ("Calibration",),
+    "errors": (
         "InvalidData",
         "MissingChannel",
         "Refused",
         "TooShort",
         "TriaxcalError",
     ),
-    "triaxcal.model.gravity": (
+    "model.gravity": (
         "HEIGHTS_M",
         "local_gravity_g",
     ),
-    "triaxcal.model.samples": (
+    "model.samples": (
         "Moment",
         "Samples",
     ),
-    "triaxcal.model.sensor": ("Sensor",),
-    "triaxcal.poses.pose": (
+    "model.sensor": ("Sensor",),
+    "poses.pose": (
         "Pose",
         "StillSpan",
     ),
-    "triaxcal.progress": ("Stage",),
-    "triaxcal.uncertainty": ("Stated",),
+    "progress": ("Stage",),
+    "uncertainty": ("Stated",),
 }
-_WHERE = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "HEIGHTS_M",
@@ -183,19 +183,14 @@ __all__ = [
 
 
 if not TYPE_CHECKING:  # a checker would take any name for one that is here
+    _find = lazily(__name__, _NAMES, _ROOMS)
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
             from importlib.metadata import version  # as slow to import as numpy's half
 
             return version("triaxcal")
-        if name in _ROOMS:
-            return import_module(f"triaxcal.{name}")
-        if name not in _WHERE:
-            raise AttributeError(f"module 'triaxcal' has no attribute '{name}'")
-        found = getattr(import_module(_WHERE[name]), name)
-        globals()[name] = found
-        return found
+        return _find(name)
 
 
 def __dir__() -> list[str]:

@@ -26,7 +26,13 @@ def compute_with_one_thread() -> None:
     """Linear algebra in this process, for good: whoever computes figures that
     an audit compares calls it first. Costs next to nothing when called again."""
     _libraries().limit(limits=1, user_api="blas")
-    for inverse in (numpy.linalg.inv, scipy.linalg.inv):  # the buffer of each library is taken at its first use
+    _take_buffers()
+
+
+@cache
+def _take_buffers() -> None:
+    """Each library takes its own at its first use."""
+    for inverse in (numpy.linalg.inv, scipy.linalg.inv):
         inverse(numpy.eye(2))
 
 

@@ -1,19 +1,49 @@
 """The JSON document of a closed loop (`triaxcal.loop/1`), and how documents are
-written."""
+written and parsed."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import triaxcal as tc
+import triaxcal_drivers as td
 from triaxcald.caveats import UNIT, correction_options
 
 NO_LONGER_OF_A_FINDING = ("p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g")
 NO_LONGER_OF_WHAT_IS_UNEXPLAINED = ("p_value", "or_spoiled", "or_named", "only_inside")
 """Keys of 0.1 that mean nothing since names have probabilities: others read
 them, and find null."""
+
+
+CONTAINERS_MOST = 400_000
+"""Lists and objects of a JSON document, with the brackets inside its texts: one
+of a thousand poses has some 20,000, and each takes 70 bytes and more."""
+
+
+class TooManyContainers(ValueError):
+    """More lists and objects than `CONTAINERS_MOST`."""
+
+    def __init__(self) -> None:
+        super().__init__(f"more than {CONTAINERS_MOST} lists and objects")
+
+
+def json_value(data: bytes) -> Any:
+    """JSON in UTF-8, in which no object has a key twice. Raises ValueError, of
+    which TooManyContainers is one, and RecursionError."""
+    if data.count(b"[") + data.count(b"{") > CONTAINERS_MOST:
+        raise TooManyContainers
+    return json.loads(data.decode(), object_pairs_hook=_each_key_once)
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    held = dict(pairs)
+    if len(held) < len(pairs):
+        twice = next(k for k, count in Counter(k for k, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key '{td.hints.clipped(twice)}' is given twice")
+    return held
 
 
 def to_text(document: Mapping[str, Any]) -> str:

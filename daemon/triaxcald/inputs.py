@@ -4,7 +4,6 @@ begins with."""
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
+from triaxcald.documents import TooManyContainers, json_value
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, of_poses, together
 from triaxcald.provision.identity import same_serial
@@ -29,9 +29,6 @@ from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
-CONTAINERS_MOST = 400_000
-"""Lists and objects of a JSON document, with the brackets inside its texts: one
-of a thousand poses has some 20,000, and each takes 70 bytes and more."""
 PROFILE = PROFILE_FILE
 UNKNOWN_NOISE = "unknown_noise"
 
@@ -292,13 +289,12 @@ def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
     the line at fault, or with what the data are where they are of another
     kind."""
     _require_no_other_kind(data, where)
-    if data.count(b"[") + data.count(b"{") > CONTAINERS_MOST:
-        raise InputError(f"{where}: more than {CONTAINERS_MOST} lists and objects, expected a JSON document")
     try:
-        text = data.decode()
-        document = json.loads(text, object_pairs_hook=_each_key_once)
-        if "\\u" in text:
+        document = json_value(data)
+        if b"\\u" in data:
             json.dumps(document, ensure_ascii=False).encode()
+    except TooManyContainers as e:
+        raise InputError(f"{where}: {e}, expected a JSON document") from e
     except json.JSONDecodeError as e:
         raise InputError(f"{where}, line {e.lineno}: not JSON: {e.msg}; expected a JSON document") from e
     except RecursionError as e:
@@ -312,11 +308,3 @@ def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{where}: expected a JSON object")
     return document
-
-
-def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    held = dict(pairs)
-    if len(held) < len(pairs):
-        twice = next(k for k, count in Counter(k for k, _ in pairs).items() if count > 1)
-        raise ValueError(f"the key '{td.hints.clipped(twice)}' is given twice")
-    return held

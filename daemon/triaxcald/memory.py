@@ -46,31 +46,32 @@ def _says_so(e: BaseException) -> bool:
 
 def no_room_left() -> bool:
     """Whether a limit of the address space (``ulimit -v``) is all but used up."""
-    return _limit() is not None and not _fits(_ROOM_BYTES)
+    return _limit_in_the_way(_ROOM_BYTES) is not None
 
 
 def require_address_space() -> None:
     """Before the libraries are loaded, where a limit (``ulimit -v``) is set:
     OpenBLAS that finds no room for its buffers ends the process with 1, or
     tries again for a quarter of an hour. Raises MemoryError."""
-    limit = _limit()
-    if limit is None:
-        return
     wanted = _LIBRARIES_BYTES + _THREAD_BYTES * _threads()
-    if not _fits(wanted):
+    if (limit := _limit_in_the_way(wanted)) is not None:
         raise MemoryError(
             f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for the {wanted >> 20} MiB"
             " of the libraries"
         )
 
 
-def _fits(size: int) -> bool:
-    """Whether so many bytes of address space are left."""
+def _limit_in_the_way(size: int) -> int | None:
+    """The limit of the address space in bytes, where it leaves no room for so
+    many more; else None."""
+    limit = _limit()
+    if limit is None:
+        return None
     try:
         mmap.mmap(-1, size).close()
     except OSError:
-        return False
-    return True
+        return limit
+    return None
 
 
 def _limit() -> int | None:

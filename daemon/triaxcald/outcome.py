@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
+from triaxcald.documents import json_value
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 from triaxcald.schema.codes import Code as Code
@@ -172,37 +172,3 @@ def registers_told(p: Provisioning) -> RegistersDone:
 
 def digest_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-@dataclass(frozen=True)
-class History:
-    """Earlier attempts at a unit in the station's folder: the digest of the latest
-    outcome, None without one, and the number of attempts."""
-
-    latest: str | None = None
-    attempts: int = 0
-    passed: bool = False
-
-    @staticmethod
-    def of(folder: Path, serial: str | None) -> History:
-        """``serial`` is that of the unit, or the expected one of a unit that did not
-        answer."""
-        if serial is None:
-            return History()
-        found: list[tuple[str, str, bool]] = []
-        attempts = 0
-        for path in folder.glob(f"*{SUFFIX}"):
-            try:
-                data = path.read_bytes()
-                held = json.loads(data)
-            except (OSError, ValueError, RecursionError):  # not one of ours
-                continue
-            if not isinstance(held, dict) or held.get("format") != FORMAT:
-                continue
-            work = held.get("work")
-            meant = work.get("serial") if isinstance(work, dict) else None
-            if held.get("serial") == serial:
-                found.append((str(held.get("ended", "")), digest_of(data), held.get("verdict") == Verdict.PASS))
-            attempts += serial in (held.get("serial"), meant)
-        latest = max(found, default=None)
-        return History(latest[1], attempts, latest[2]) if latest else History(None, attempts)

@@ -7,6 +7,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -129,6 +130,36 @@ def _is_public(module: object, names: Sequence[str]) -> bool:
             return False
         module = getattr(module, name)
     return True
+
+
+LAZY = [
+    ".".join(face.relative_to(Path(house.__file__).parents[1]).parent.parts)
+    for house in (triaxcal, triaxcal_drivers)
+    for face in sorted(Path(house.__file__).parent.rglob("__init__.py"))
+    if "lazily(" in face.read_text()
+]
+"""Packages that load their public names when these are first used."""
+
+
+def test_both_houses_and_rooms_of_both_load_lazily() -> None:
+    assert {"triaxcal", "triaxcal.text", "triaxcal_drivers", "triaxcal_drivers.can"} <= set(LAZY)
+
+
+@pytest.mark.parametrize("package", LAZY)
+def test_a_type_checker_sees_the_names_that_are_loaded_lazily(package: str) -> None:
+    face = import_module(package)
+    loaded = {(package, name) for name in getattr(face, "_ROOMS", ())}
+    loaded |= {(f"{package}.{module}", name) for module, names in getattr(face, "_NAMES", {}).items() for name in names}
+    assert set(_seen_by_a_type_checker(Path(str(face.__file__)).read_text())) == loaded
+
+
+def _seen_by_a_type_checker(source: str) -> Iterator[tuple[str, str]]:
+    """Module and name of each import under ``if TYPE_CHECKING``."""
+    for block in ast.parse(source).body:
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            for statement in block.body:
+                if isinstance(statement, ast.ImportFrom):
+                    yield from ((str(statement.module), alias.asname or alias.name) for alias in statement.names)
 
 
 def test_the_metrology_says_that_it_is_typed() -> None:

@@ -21,6 +21,7 @@ from triaxcal.effects.empirical import Empirical
 from triaxcal.estimate.calibration import (
     BirgeRatio,
     Calibration,
+    Caution,
     ExcessVariance,
     ReferenceEpoch,
     Residual,
@@ -477,7 +478,7 @@ def corrected(before: Calibration, posterior: Posterior, at: ReferenceEpoch) -> 
         slopes=rows.slopes,
         # What residuals show beyond noise is in the covariance, by the
         # probability of whatever may have made it.
-        cautions=tuple(c for c in before.cautions if not isinstance(c, BirgeRatio | ExcessVariance)),
+        cautions=_without(before.cautions, BirgeRatio, ExcessVariance),
         holds_at=at,
         linear_only=before if model_average.sensor.effects else None,
     )
@@ -486,8 +487,12 @@ def corrected(before: Calibration, posterior: Posterior, at: ReferenceEpoch) -> 
     beyond = extrapolated(after)
     after = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
     after = _with_residuals(after, rows, model_average)
-    others = (c for c in after.cautions if not isinstance(c, ResidualsTooSmall))
+    others = _without(after.cautions, ResidualsTooSmall)
     return replace(after, cautions=(*others, *too_small(after.residual))), refused
+
+
+def _without(cautions: Sequence[Caution], *kinds: type[Caution]) -> tuple[Caution, ...]:
+    return tuple(c for c in cautions if not isinstance(c, kinds))
 
 
 def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, float]:

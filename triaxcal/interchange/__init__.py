@@ -1,8 +1,7 @@
 """Values in the formats of other programs: JSON documents, written and read, and
 samples as arrays or tables."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from triaxcal.interchange.calibration_document import (
     WEIGHT,
@@ -31,11 +30,12 @@ from triaxcal.interchange.calibration_reading import (
     reference_unit_in,
     sensor_of,
 )
+from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
 
-_LATER = ("agreement_document", "with_recordings")
+_NAMES = {"pooled_documents": ("agreement_document", "with_recordings")}
 """They import the diagnosis, which most commands do not need."""
 
 __all__ = [
@@ -68,8 +68,4 @@ __all__ = [
 
 
 if not TYPE_CHECKING:  # a checker would take any name for one that is here
-
-    def __getattr__(name: str) -> Any:
-        if name not in _LATER:
-            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-        return getattr(import_module(f"{__name__}.pooled_documents"), name)
+    __getattr__ = lazily(__name__, _NAMES)

@@ -5,9 +5,9 @@ The one room that makes sentences; no other reads them back. An effect brings
 its own remedy, and an exception its own line.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from triaxcal.lazy import lazily
 from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.calibration import as_at, holds, html, poses, short, summary, use, verification
 from triaxcal.text.cautions import caution
@@ -16,7 +16,7 @@ from triaxcal.text.quality import quality, quality_line
 if TYPE_CHECKING:
     from triaxcal.text import advice, bias_update, diagnosis, pooled_units, traces
 
-_LATER = ("advice", "bias_update", "diagnosis", "pooled_units", "traces")
+_ROOMS = ("advice", "bias_update", "diagnosis", "pooled_units", "traces")
 """Chapters that import the diagnosis, which most commands do without."""
 
 __all__ = [
@@ -43,8 +43,4 @@ __all__ = [
 
 
 if not TYPE_CHECKING:  # a checker would take any name for one that is here
-
-    def __getattr__(name: str) -> Any:
-        if name not in _LATER:
-            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-        return import_module(f"{__name__}.{name}")
+    __getattr__ = lazily(__name__, {}, _ROOMS)

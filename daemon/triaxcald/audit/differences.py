@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
 
+from triaxcald.documents import json_value
+
 MOST = 8
 """So many differences of one document are listed, the others counted."""
 
@@ -101,7 +103,7 @@ def compare(part: str, stored: bytes, again: bytes, *, by_another: bool = False)
     if stored == again:
         return []
     try:
-        before = json.loads(stored)
+        before = json_value(stored)
     except (ValueError, RecursionError):
         return [Difference(part, Kind.NO_DOCUMENT)]
     found = list(differing(part, before, json.loads(again), by_another=by_another))

@@ -19,9 +19,6 @@ BAD_INPUT = 2
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Settings of the libraries of linear algebra, which they read when they are
 loaded. Figures must not depend on how many threads a computer has."""
-COMPUTING = ("fitting:", "measuring:", "planning:", "framing:", "recordings:audit_")
-"""Commands that load the linear algebra before they read a file, while there is
-room for it: OpenBLAS that finds none later ends the process with 1."""
 
 
 def parser() -> OneLineParser:
@@ -85,7 +82,7 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
         os.environ.update(dict.fromkeys(THREADS, "1"))
         module, _, name = chosen.run.partition(":")
         command = getattr(import_module(f"triaxcald.cli.{module}"), name)
-        if "scipy" in sys.modules or chosen.run.startswith(COMPUTING):
+        if "scipy" in sys.modules or chosen.computes:
             from triaxcald.computer import compute_with_one_thread
 
             compute_with_one_thread()

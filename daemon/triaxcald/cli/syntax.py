@@ -1,7 +1,8 @@
 """All commands with their arguments and help. Imports nothing that works: a
 command's own module is imported to run it.
 
-``run`` of what is parsed names module and function ("fitting:fit_command")."""
+``run`` of what is parsed names module and function ("fitting:fit_command"),
+``computes`` whether the command needs linear algebra."""
 
 from __future__ import annotations
 
@@ -282,16 +283,20 @@ def register(commands: Any) -> None:
     _audits(commands)
 
 
-def _command(commands: Any, name: str, run: str, help_line: str, more: str = "", example: str = "") -> Any:
+def _command(
+    commands: Any, name: str, run: str, help_line: str, more: str = "", example: str = "", *, computes: bool = False
+) -> Any:
     """``more`` follows the line in the command's own help, and the ``example``
-    stands below the options."""
+    stands below the options. One that ``computes`` loads the linear algebra
+    before it reads a file, while there is room for it: OpenBLAS that finds none
+    later ends the process with 1."""
     p = commands.add_parser(
         name,
         help=help_line,
         description=f"{help_line[:1].upper()}{help_line[1:]}." + (f" {more}" if more else ""),
         epilog=f"example: triaxcal {example}" if example else None,
     )
-    p.set_defaults(run=run)
+    p.set_defaults(run=run, computes=computes)
     return p
 
 
@@ -391,12 +396,14 @@ def _on_recordings(commands: Any) -> None:
         commands, "poses", "measuring:poses", "find the still spans of a recording",
         "Means and standard errors are in the output's unit, times in seconds from the first sample. No threshold is "
         "set: the noise is learned from the recording.", "poses rec.csv",
+        computes=True,
     )  # fmt: skip
     add_recording(p)
     p = _command(
         commands, "fit", "fitting:fit_command", "fit the linear model to a recording's still poses",
         "Scale factors, misalignments [rad] and biases [g] with their standard errors; at least 9 poses, better 14.",
         "fit rec.csv --sign=-,-,- -o cal.json --report fit.html",
+        computes=True,
     )  # fmt: skip
     add_recording(p)
     _add_ways(p)
@@ -405,6 +412,7 @@ def _on_recordings(commands: Any) -> None:
         commands, "diagnose", "fitting:diagnose_command", "find, add and judge effects that the linear model lacks",
         "Nonlinearity, temperature, drift, hysteresis and more, with the error of the magnitude [g] before and after.",
         "diagnose rec.csv --check other.csv -o cal.json --report loop.html",
+        computes=True,
     )  # fmt: skip
     add_recording(p, several="several are of one unit, in order of time")
     _add_results(p)
@@ -421,6 +429,7 @@ def _on_recordings(commands: Any) -> None:
         commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",
         "Scale factors, misalignments and effects are kept; three distinct poses are needed, four are better.",
         "rezero cal.json rec.csv --poses 4 -o cal2.json",
+        computes=True,
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
     add_recording(p)
@@ -430,6 +439,7 @@ def _on_recordings(commands: Any) -> None:
         commands, "apply", "measuring:apply_command", "calibrated readings of a recording",
         "Writes its samples with ax, ay, az behind them, in the unit of the reference vector (g, unless the "
         "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
+        computes=True,
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
     p.add_argument("recording", metavar="REC", help=RECORDING)
@@ -446,6 +456,7 @@ def _on_recordings(commands: Any) -> None:
         commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",
         "Errors are |a| less the reference, in its unit, with the standard error that noise gives each.",
         "verify cal.json rec.csv --limit 2e-4",
+        computes=True,
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL.json")
     add_recording(p)
@@ -499,6 +510,7 @@ def _frame(commands: Any) -> None:
     p = _command(
         commands, "frame", "framing:frame_command", "units on one fixture in the frame of its faces",
         "Rotations from each sensor's frame to the fixture's, in rad.", "frame left.csv right.csv --datum=-Z,-X",
+        computes=True,
     )  # fmt: skip
     add_recording(p, several="one of each unit")
     p.add_argument(
@@ -561,6 +573,7 @@ def _planning(commands: Any) -> None:
     p = _command(
         commands, "plan", "planning:plan_command", "a pose plan, and what it can and cannot see",
         "With a recording: the poses that are still worth adding to it.", "plan --poses 26",
+        computes=True,
     )  # fmt: skip
     p.add_argument(
         "--poses", type=count, metavar="14|26|N", help="distinct directions, the first repeated at the end; 26"
@@ -617,6 +630,7 @@ def _audits(commands: Any) -> None:
     p = _command(
         commands, "audit", "recordings:audit_command", "recompute results from recordings and compare",
         "A summary follows several; one unreadable file hides no other.", "audit recordings/",
+        computes=True,
     )  # fmt: skip
     p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
     add_json(p)

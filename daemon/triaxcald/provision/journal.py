@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import triaxcal_drivers as td
+from triaxcald.documents import json_value
 from triaxcald.errors import DiskError, InputError
 from triaxcald.files import synchronise, write_durably
 from triaxcald.provision.access import RegisterLink
@@ -188,7 +189,7 @@ def open_journal(folder: Path, profile: td.Profile, slot: str, serial: str | Non
 def parse(text: bytes, *, where: str) -> Entry:
     """Raises InputError."""
     try:
-        held: Any = json.loads(text)
+        held: Any = json_value(text)
         if held["format"] != FORMAT:
             raise ValueError(f"format: expected '{FORMAT}'")
         if held["step"] not in get_args(Step):

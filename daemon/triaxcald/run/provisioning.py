@@ -4,7 +4,6 @@ short, or an old one put back."""
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,9 +14,10 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.abort import AbortNotice, at_abort
-from triaxcald.documents import to_text
+from triaxcald.documents import json_value, to_text
 from triaxcald.errors import BAD_INPUT, Implausible, InputError, RecordingError
 from triaxcald.files import write_new
+from triaxcald.inputs import document_bytes
 from triaxcald.outcome import (
     SUFFIX,
     Code,
@@ -280,11 +280,7 @@ def unit_in(path: Path) -> str | None:
 
 def _kept(path: Path) -> tuple[Mapping[str, bytes], str | None, str | None]:
     if path.suffix != ".mcap":
-        try:
-            data = path.read_bytes()
-        except OSError as e:
-            raise InputError(f"{path}: {e.strerror}") from e
-        entry = parse(data, where=str(path))
+        entry = parse(document_bytes(str(path)), where=str(path))
         return entry.before, entry.serial, entry.unit
     with Recording.open(path, unfinished=True) as recording:
         kept = next((n for n in (REGISTERS_EARLIER, REGISTERS_BEFORE) if n in recording.attachments), None)
@@ -292,7 +288,7 @@ def _kept(path: Path) -> tuple[Mapping[str, bytes], str | None, str | None]:
             raise RecordingError(f"{path}: attachment {REGISTERS_BEFORE}: missing; no register was written in it")
         unit = recording.metadata.get("unit", {})
         try:
-            held = registers_of(json.loads(recording.attachments[kept]))
+            held = registers_of(json_value(recording.attachments[kept]))
         except (ValueError, TypeError, AttributeError) as e:
             raise RecordingError(f"{path}: attachment {kept}: no registers: {e}") from e
         return held, unit.get("serial") or None, unit.get("name") or None

@@ -58,6 +58,12 @@ def test_every_command_has_a_function_that_runs_it_and_help_that_says_what_it_do
     assert command.epilog is None or command.epilog.startswith(f"example: {command.prog} ")
 
 
+def test_commands_that_compute_are_marked_where_they_are_declared() -> None:
+    marked = {command.prog for command in leaves(parser()) if command.get_default("computes")}
+    names = ("poses", "fit", "diagnose", "rezero", "apply", "verify", "frame", "plan", "audit")
+    assert marked == {f"triaxcal {name}" for name in names}
+
+
 def test_without_a_command_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     shown = capsys.readouterr().out

@@ -17,6 +17,7 @@ from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.errors import DiskError, InputError
 from triaxcald.provision.journal import Entry, Journal, Owner, journals_of, open_journal, parse
+from triaxcald.run.provisioning import unit_in
 from triaxcald.software import new_run_id
 
 LEFT = Owner("TRIAX/REF", "0007", "left")
@@ -204,8 +205,17 @@ async def test_nothing_is_written_where_the_disk_takes_no_journal(tmp_path: Path
         (b'"text"', "no journal"),
         (b'{"format": "triaxcal.journal/1", "step": "dancing"}', "step: expected one of"),
         (b"[" * 100_000, "no journal"),
+        (b"[" + b"[]," * 400_000 + b"[]]", "more than 400000 lists and objects"),
+        (b'{"step": "writing", "step": "stored"}', "the key 'step' is given twice"),
     ],
 )
 def test_what_is_no_journal_is_told(text: bytes, said: str) -> None:
     with pytest.raises(InputError, match=said):
         parse(text, where="a.json")
+
+
+def test_a_journal_to_restore_from_has_the_bounds_of_a_document(tmp_path: Path) -> None:
+    path = tmp_path / "journal.json"
+    path.write_bytes(b" " * (4 * 2**20 + 1))
+    with pytest.raises(InputError, match="larger than the 4 MiB that such a file may have"):
+        unit_in(path)

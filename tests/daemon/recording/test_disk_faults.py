@@ -65,6 +65,13 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
         subprocess.run(["umount", folder], check=True)
 
 
+@pytest.fixture
+def looks_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The writer's look at an idle file does not come before the next job, however
+    slow the machine is."""
+    monkeypatch.setattr(writer_module, "LOOK_S", 3600.0)
+
+
 def record_until_the_disk_fails(writer: RecordingWriter, clock: Any, most: int = 500) -> str:
     def record() -> None:
         for number in range(most):
@@ -100,6 +107,7 @@ def test_a_recording_is_ended_while_there_is_room_for_its_end(small_disk: Callab
     assert all(batch.payload == noise(i).payload for i, batch in enumerate(batches))
 
 
+@pytest.mark.usefixtures("looks_when_asked")
 def test_a_disk_that_others_fill_leaves_a_file_that_is_whole_up_to_the_second_stated(
     small_disk: Callable[[int], Path], clock: Any, tmp_path: Path
 ) -> None:
@@ -131,9 +139,8 @@ def test_no_recording_begins_on_a_disk_that_is_full(small_disk: Callable[[int], 
     assert not (folder / "rec.mcap").exists()
 
 
-def test_a_folder_that_is_removed_is_said_within_a_second_of_the_clock(
-    tmp_path: Path, clock: Any, wait_until: Callable[[Callable[[], bool]], None]
-) -> None:
+@pytest.mark.usefixtures("looks_when_asked")
+def test_a_folder_that_is_removed_is_said_within_a_second_of_the_clock(tmp_path: Path, clock: Any) -> None:
     (tmp_path / "folder").mkdir()
     writer = RecordingWriter(tmp_path / "folder" / "rec.mcap", metadata={"bus": {}}, clock_ns=clock)
     writer.raw("bus/0", noise(0))
