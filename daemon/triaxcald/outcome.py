@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
@@ -142,20 +140,3 @@ def registers_told(p: Provisioning) -> RegistersDone:
 
 def digest_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def latest_of(folder: Path, serial: str | None) -> str | None:
-    """The digest of the latest outcome of a unit in the station's folder; None
-    where there is none."""
-    if serial is None:
-        return None
-    found: list[tuple[str, str]] = []
-    for path in folder.glob(f"*{serial}-*{SUFFIX}"):
-        try:
-            data = path.read_bytes()
-            held = json.loads(data)
-        except (OSError, ValueError, RecursionError):  # not one of ours
-            continue
-        if isinstance(held, dict) and held.get("format") == FORMAT and held.get("serial") == serial:
-            found.append((str(held.get("ended", "")), digest_of(data)))
-    return max(found)[1] if found else None

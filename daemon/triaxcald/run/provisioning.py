@@ -23,7 +23,6 @@ from triaxcald.outcome import (
     Code,
     Ending,
     Papers,
-    latest_of,
     outcome_document,
     registers_told,
 )
@@ -46,6 +45,7 @@ from triaxcald.software import software
 from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
+from triaxcald.store import latest_of
 
 
 @dataclass(frozen=True)

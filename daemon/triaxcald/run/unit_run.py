@@ -32,7 +32,6 @@ from triaxcald.outcome import (
     Papers,
     Verdict,
     digest_of,
-    latest_of,
     measured_in,
     outcome_document,
     registers_told,
@@ -54,6 +53,7 @@ from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
+from triaxcald.store import latest_of
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
