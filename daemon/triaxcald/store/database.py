@@ -39,7 +39,6 @@ def _outcome_tables() -> tuple[str, ...]:
         f"CREATE TABLE run ({columns}, {own}, PRIMARY KEY (outcome))",
         "CREATE INDEX run_serial ON run (serial)",
         "CREATE INDEX run_work_serial ON run (work_serial)",
-        "CREATE INDEX run_outcome_sha256 ON run (outcome_sha256)",
     )
 
 
@@ -90,7 +89,7 @@ class Database:
                     self._open()
                 assert self._db is not None
                 return work(self._db)
-            except (sqlite3.Error, _NotOurs) as e:
+            except (sqlite3.Error, UnicodeDecodeError, _NotOurs) as e:
                 if self._in_memory:
                     raise
                 before, self._db = self._db, None
@@ -143,7 +142,7 @@ class Database:
         db = _connected(":memory:")
         _prepare(db)
         if before is not None:
-            with suppress(sqlite3.Error), transaction(db):
+            with suppress(sqlite3.Error, UnicodeDecodeError), transaction(db):
                 for (table,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
                     rows = before.execute(f"SELECT * FROM {table}")
                     db.executemany(f"INSERT INTO {table} VALUES ({', '.join('?' * len(rows.description))})", rows)
@@ -193,7 +192,8 @@ def _version(db: sqlite3.Connection) -> int:
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
-def _code(e: sqlite3.Error) -> int:
-    """The primary code of SQLite; -1 of an error that Python found."""
+def _code(e: Exception) -> int:
+    """The primary code of SQLite; -1 of an error that Python found, as in a text that
+    is no UTF-8."""
     code: int = getattr(e, "sqlite_errorcode", -1)
     return code if code < 0 else code & 0xFF

@@ -98,7 +98,7 @@ class Store:
         """The number of attempts at a unit so far, by the expected serial number, else
         by the reported one. It does not fall where early outcomes were moved away."""
         found = self._ask(
-            f"SELECT count(DISTINCT coalesce(run, outcome_sha256)), coalesce(max(attempt), 0) FROM run WHERE {_TRIED}",
+            f"SELECT count(DISTINCT coalesce(run, outcome)), coalesce(max(attempt), 0) FROM run WHERE {_TRIED}",
             serial,
         )
         return max(int(cell or 0) for cell in found) if found else 0
@@ -118,14 +118,14 @@ class Store:
     ) -> Runs:
         """Runs that began (ended, where there is no start) from ``since_us`` on and
         before ``until_us`` [µs since 1970], of this reported or expected serial number,
-        with this code; in the order of time. Two files with the same bytes are one run.
-        Raises OSError where the folder cannot be read."""
+        with this code; in the order of time. Raises OSError where the folder cannot be read."""
         given = {
             "at_us >= ?": since_us, "at_us < ?": until_us,
             "? IN (serial, work_serial)": serial, "code = ?": code,
         }  # fmt: skip
         wanted = {condition: value for condition, value in given.items() if value is not None}
-        query = f"SELECT {_COLUMNS} FROM run WHERE {' AND '.join((_FIRST_COPY, *wanted))} ORDER BY at_us, outcome"
+        where = f" WHERE {' AND '.join(wanted)}" if wanted else ""
+        query = f"SELECT {_COLUMNS} FROM run{where} ORDER BY at_us, outcome"
 
         def work(db: sqlite3.Connection) -> Runs:
             self._refresh(db)
@@ -235,7 +235,7 @@ class Store:
 
 
 _ORDER = (*NAMES, *OWN)
-_COLUMNS = ", ".join(f'run."{name}"' for name in NAMES)
+_COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
 _KINDS: dict[Kind, type] = {Kind.TEXT: str, Kind.TEXTS: str, Kind.WHOLE: int, Kind.NUMBER: float}
 _TYPES = tuple(_KINDS[c.kind] if c.required else (_KINDS[c.kind], type(None)) for c in COLUMNS)
 _BESIDE = tuple(NAMES.index(column) for column in BESIDE)
@@ -243,10 +243,6 @@ _FORGET = "DELETE FROM file WHERE name = ?"
 _INSERT = f"INSERT INTO run VALUES ({', '.join('?' * len(_ORDER))})"
 _TRIED = "tried AND :serial IN (serial, work_serial) AND :serial = coalesce(work_serial, serial)"
 _LAST = "ORDER BY ended_us DESC, outcome DESC LIMIT 1"
-_FIRST_COPY = (
-    "NOT EXISTS (SELECT 1 FROM run AS other WHERE other.outcome_sha256 = run.outcome_sha256 "
-    "AND other.outcome < run.outcome)"
-)
 
 
 def latest_of(folder: Path, serial: str | None) -> str | None:
