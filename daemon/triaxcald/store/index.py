@@ -118,7 +118,8 @@ class Store:
     ) -> Runs:
         """Runs that began (ended, where there is no start) from ``since_us`` on and
         before ``until_us`` [µs since 1970], of this reported or expected serial number,
-        with this code; in the order of time. Raises OSError where the folder cannot be read."""
+        with this code; in the order of time. Raises OSError where the folder cannot be
+        read."""
         given = {
             "at_us >= ?": since_us, "at_us < ?": until_us,
             "? IN (serial, work_serial)": serial, "code = ?": code,

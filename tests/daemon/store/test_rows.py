@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def cells(of: dict[str, Any], name: str = "a.outcome.json") -> dict[str, Any]:
 def put(of: dict[str, Any], key: tuple[str | int, ...], value: Any) -> None:
     """At the place; lists have three items."""
     at: Any = of
-    for step, following in zip(key, key[1:], strict=False):
+    for step, following in pairwise(key):
         if isinstance(step, str) and not isinstance(at.get(step), (dict, list)):
             at[step] = [None] * 3 if isinstance(following, int) else {}
         at = at[step]
