@@ -19,9 +19,11 @@ DAMAGED: Final = ".damaged"
 """Behind the name of a file that is damaged, or of another program."""
 BUSY_S = 5.0
 """Longest wait for another process. It holds the file for one batch at a time."""
-OWN: Final = {"at_us": "INTEGER NOT NULL", "ended_us": "INTEGER NOT NULL", "tried": "INTEGER NOT NULL"}
-"""Columns of `run` that only the index has: start (else end) and end in µs since 1970,
-and whether it was an attempt at the unit."""
+TIMES: Final = ("at_us", "ended_us", "tried")
+"""Columns that only the index has: start (else end) and end in µs since 1970, and
+whether it was an attempt at the unit."""
+OWN: Final = (*TIMES, "crc")
+"""With a check sum of all cells before it."""
 
 T = TypeVar("T")
 _SQL = {Kind.TEXT: "TEXT", Kind.TEXTS: "TEXT", Kind.WHOLE: "INTEGER", Kind.NUMBER: "REAL"}
@@ -31,7 +33,7 @@ def _outcome_tables() -> tuple[str, ...]:
     """What is made from the outcomes. A migration that changes it drops both tables:
     the next look at the folder fills them."""
     columns = ", ".join(f'"{c.name}" {_SQL[c.kind]}{" NOT NULL" if c.required else ""}' for c in COLUMNS)
-    own = ", ".join(f"{name} {kind}" for name, kind in OWN.items())
+    own = ", ".join(f"{name} INTEGER NOT NULL" for name in OWN)
     return (
         # Every file of that name; one without a row in `run` is no outcome.
         "CREATE TABLE file (name TEXT PRIMARY KEY, size INTEGER NOT NULL, modified_ns INTEGER NOT NULL, "
@@ -174,7 +176,7 @@ def _prepare(db: sqlite3.Connection) -> None:
     version = _version(db)
     if version > len(MIGRATIONS):
         raise _NotOurs
-    if version and (told := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+    if version and (told := db.execute("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
         raise sqlite3.DatabaseError(told)
     if version == len(MIGRATIONS):
         return

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import marshal
 import os
 import sqlite3
 import stat
 import threading
 import time
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,7 @@ from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
-from triaxcald.store.database import OWN, Database, transaction
+from triaxcald.store.database import OWN, TIMES, Database, transaction
 from triaxcald.store.rows import BESIDE, Cell, NoOutcome, cells_of
 
 BATCH = 500
@@ -126,7 +128,7 @@ class Store:
         }  # fmt: skip
         wanted = {condition: value for condition, value in given.items() if value is not None}
         where = f" WHERE {' AND '.join(wanted)}" if wanted else ""
-        query = f"SELECT {_COLUMNS} FROM run{where} ORDER BY at_us, outcome"
+        query = f"SELECT * FROM run{where} ORDER BY at_us, outcome"
 
         def work(db: sqlite3.Connection) -> Runs:
             self._refresh(db)
@@ -143,13 +145,15 @@ class Store:
             return self._database.on(work)
 
     def _present(self, row: Cells) -> Cells:
-        """The row without names of files that are not in the folder. Raises
-        sqlite3.DatabaseError where a cell has the type of another column."""
-        if not all(map(isinstance, row, _TYPES)):
-            raise sqlite3.DatabaseError("a cell has the type of another column")
-        if all(row[i] in self._names for i in _BESIDE):
-            return row
-        return tuple(None if i in _BESIDE and cell not in self._names else cell for i, cell in enumerate(row))
+        """The cells of `NAMES`, without names of files that are not in the folder.
+        Raises sqlite3.DatabaseError where a cell is not as it was written."""
+        *held, check = row
+        if check != _check(held):
+            raise sqlite3.DatabaseError("a row was changed")
+        for i in _BESIDE:
+            if held[i] not in self._names:
+                held[i] = None
+        return tuple(held[: len(NAMES)])
 
     def _ask(self, query: str, serial: str | None) -> Cells | None:
         """The first row of the answer about a serial number, by what is known where the
@@ -232,16 +236,18 @@ class Store:
             cells = cells_of(td.files.read_whole(self.folder / name, DOCUMENT_MOST), name)
         except (NoOutcome, td.files.TooLarge):
             return None
-        return tuple(cells[column] for column in _ORDER)
+        row = [cells[column] for column in (*NAMES, *TIMES)]
+        return (*row, _check(row))
 
 
-_ORDER = (*NAMES, *OWN)
-_COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
-_KINDS: dict[Kind, type] = {Kind.TEXT: str, Kind.TEXTS: str, Kind.WHOLE: int, Kind.NUMBER: float}
-_TYPES = tuple(_KINDS[c.kind] if c.required else (_KINDS[c.kind], type(None)) for c in COLUMNS)
+def _check(cells: Sequence[Cell]) -> int:
+    """SQLite itself does not see that a byte within a cell has changed."""
+    return zlib.crc32(marshal.dumps(tuple(cells), 2))  # a version without references: the same bytes each time
+
+
 _BESIDE = tuple(NAMES.index(column) for column in BESIDE)
 _FORGET = "DELETE FROM file WHERE name = ?"
-_INSERT = f"INSERT INTO run VALUES ({', '.join('?' * len(_ORDER))})"
+_INSERT = f"INSERT INTO run VALUES ({', '.join('?' * (len(NAMES) + len(OWN)))})"
 _TRIED = "tried AND :serial IN (serial, work_serial) AND :serial = coalesce(work_serial, serial)"
 _LAST = "ORDER BY ended_us DESC, outcome DESC LIMIT 1"
 

@@ -127,7 +127,7 @@ def _whole(value: Any) -> int:
 
 def _number(value: Any) -> float:
     if type(value) in (int, float) and abs(value) <= FINITE_MOST:  # which NaN is not
-        return float(value)
+        return float(value) + 0.0  # SQLite has no negative zero
     raise NoOutcome("no finite number")
 
 

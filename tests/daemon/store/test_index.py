@@ -270,7 +270,8 @@ def test_a_damaged_index_is_made_anew(write: Write, tmp_path: Path, seed: int) -
     "statement",
     [
         "DROP TABLE run", "DROP TABLE file", "ALTER TABLE run DROP COLUMN terms", "UPDATE run SET rms_g = 'wide'",
-        "UPDATE run SET terms = x'00'", "PRAGMA user_version = 0", "ALTER TABLE run ADD COLUMN more",
+        "UPDATE run SET terms = x'00'", "UPDATE run SET reason = 'other'", "UPDATE run SET at_us = 0",
+        "PRAGMA user_version = 0", "ALTER TABLE run ADD COLUMN more",
     ],
 )  # fmt: skip
 def test_tables_that_are_not_ours_are_set_aside(write: Write, tmp_path: Path, statement: str) -> None:
@@ -311,6 +312,24 @@ def test_the_file_of_an_earlier_version_gets_the_later_tables(
     assert db.execute("PRAGMA user_version").fetchone() == (2,)
     assert db.execute("SELECT count(*) FROM person").fetchone() == (0,)
     db.close()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"reason": "a\0b"}, {"reason": ""}, {"serial": "\U0001f527 µ\u202e"}, {"exit_code": -(2**62)},
+        {"verification": {"after_rms_g": -0.0}}, {"verification": {"after_rms_g": 5e-324}},
+        {"verification": {"after_rms_g": 1.7e308}}, {"verification": {"after_rms_g": 2**70}},
+        {"measured": {"terms": []}}, {"measured": {"terms": ['"', "; "]}},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_cell_comes_back_as_it_was(write: Write, tmp_path: Path, changed: dict[str, Any]) -> None:
+    write("a", **changed)
+    first = ask(tmp_path)
+    assert ask(tmp_path) == first
+    assert len(first.rows) == 1
+    assert not (tmp_path / f"{FILE}.damaged").exists()
 
 
 # Where there can be no file.
