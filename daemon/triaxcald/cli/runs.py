@@ -110,8 +110,10 @@ def _counts(rows: Iterable[Sequence[Any]], column: str) -> dict[str, int]:
 def _show(rows: Sequence[Sequence[Any]]) -> None:
     """A row a run. The table fits a terminal of 80 characters."""
     shown = [dict(zip(NAMES, row, strict=True)) for row in rows[-SHOWN_MOST:]]
-    columns = ["started (UTC)", "slot", "serial", "try", "result", "rms µg", "check µg"]
-    title = f"the last {SHOWN_MOST} of {len(rows)} runs; -o writes all" if len(rows) > SHOWN_MOST else ""
+    columns = ["started (UTC)", "slot", "serial", "try", "result", "fit", "check"]
+    title = "rms error of the fit and of the check poses in µg"
+    if len(rows) > SHOWN_MOST:
+        title = f"the last {SHOWN_MOST} of {len(rows)} runs (-o writes all), {title}"
     table(title, columns, map(_line, shown))
 
 

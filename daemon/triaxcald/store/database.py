@@ -87,6 +87,7 @@ class Database:
         replaced = False
         while True:
             try:
+                self._leave_what_was_removed()
                 if self._db is None:
                     self._open()
                 assert self._db is not None
@@ -121,20 +122,31 @@ class Database:
         except BaseException:
             db.close()
             raise
-        self._db = db
+        self._db, self._inode = db, self._present_inode()
+
+    def _present_inode(self) -> int | None:
+        try:
+            return os.lstat(self.path).st_ino
+        except OSError:
+            return None
+
+    def _leave_what_was_removed(self) -> None:
+        """Close a file that was deleted or set aside while it was open."""
+        if self._db is not None and not self._in_memory and self._present_inode() != self._inode:
+            self._db.close()
+            self._db = None
 
     def _set_aside(self) -> bool:
         """Rename the damaged file, unless another process has done so; its journal
         first, which SQLite would apply to the next file of that name. False where that
         cannot be done."""
+        if self._inode is None or self._present_inode() != self._inode:
+            return True
+        aside = unused(self.path.with_name(FILE_NAME + DAMAGED))
         try:
-            if os.lstat(self.path).st_ino == self._inode:
-                aside = unused(self.path.with_name(FILE_NAME + DAMAGED))
-                for end in ("-journal", "-wal", "-shm", ""):
-                    with suppress(FileNotFoundError):
-                        os.replace(f"{self.path}{end}", f"{aside}{end}")
-        except FileNotFoundError:
-            pass
+            for end in ("-journal", "-wal", "-shm", ""):
+                with suppress(FileNotFoundError):
+                    os.replace(f"{self.path}{end}", f"{aside}{end}")
         except OSError:
             return False
         return True

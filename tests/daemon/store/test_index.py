@@ -332,6 +332,21 @@ def test_a_cell_comes_back_as_it_was(write: Write, tmp_path: Path, changed: dict
     assert not (tmp_path / f"{FILE}.damaged").exists()
 
 
+@pytest.mark.parametrize("how", ["deleted", "replaced"])
+def test_an_index_that_is_removed_while_it_is_open_is_made_anew(write: Write, tmp_path: Path, how: str) -> None:
+    write("a")
+    with Store(tmp_path) as store:
+        before = store.runs()
+        if how == "deleted":
+            (tmp_path / FILE).unlink()
+        else:
+            (tmp_path / "other").write_bytes(b"no database")
+            (tmp_path / "other").replace(tmp_path / FILE)
+        assert store.runs() == before
+    assert (tmp_path / FILE).exists()
+    assert ask(tmp_path) == before
+
+
 # Where there can be no file.
 
 
