@@ -233,3 +233,17 @@ def test_no_run_is_written_over_an_outcome_or_through_a_link(folder: Path, tmp_p
     (tmp_path / "link.csv").symlink_to(tmp_path / "elsewhere.csv")
     done = triaxcal("results", folder, "-o", tmp_path / "link.csv")
     assert (done.code, (tmp_path / "elsewhere.csv").exists()) == (2, False)
+
+
+def test_the_runs_of_a_station_are_those_of_its_outcomes(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("results", finished_run.can.parent, "--json")
+    assert (done.code, done.json["skipped"]) == (0, [])
+    outcomes = {p.name: json.loads(p.read_bytes()) for p in finished_run.can.parent.glob("*.outcome.json")}
+    assert {row["outcome"] for row in done.json["runs"]} == set(outcomes)
+    for row in done.json["runs"]:
+        outcome = outcomes[row["outcome"]]
+        assert (row["unit"], row["serial"], row["verdict"]) == (outcome["unit"], outcome["serial"], "pass")
+        assert row["rms_g"] == outcome["measured"]["after"]["rms_g"]
+        assert row["verification_rms_g"] == outcome["verification"]["after_rms_g"]
+        for kind in ("recording", "certificate", "report"):
+            assert (finished_run.can.parent / row[kind]).exists()
