@@ -6,11 +6,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import triaxcal as tc
-from triaxcald.documents import json_value
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 from triaxcald.schema.codes import Code as Code

@@ -18,6 +18,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Verdict
 from triaxcald.schema.outcome import Outcome
+from triaxcald.schema.results import Results
 from triaxcald.schema.run import Demo, Run
 from triaxcald.schema.verification import Verification
 
@@ -34,6 +35,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "outcome": Outcome,
     "run": Run,
     "demo": Demo,
+    "results": Results,
 }
 JSON_TYPES = {
     "string": "text",
@@ -130,6 +132,13 @@ DEMO = """
 The units are simulated ones. Besides the keys of a run:
 
 """
+RESULTS = """# Results
+
+`triaxcal results FOLDER --json` prints `triaxcal.results/1`. A table (`-o`) has the keys of `runs` as columns, an empty cell for `null`, and `terms` in one cell, separated by `; `. Table `run` of the [index](../how-to/run-as-a-service.md#results-of-all-runs) has the same columns.
+
+Made from the columns in `daemon/triaxcald/schema/columns.py` by `docs/reference/documents.py`; [JSON Schema](results.schema.json).
+
+"""  # noqa: E501
 JOURNAL = """
 ## Journal
 
@@ -147,6 +156,7 @@ def pages() -> dict[Path, str]:
         "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
         "outcome": _outcome(),
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),
+        "results": RESULTS + _keys(Results),
     }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 

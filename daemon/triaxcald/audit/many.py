@@ -26,21 +26,26 @@ class Audited:
     exit_code: int = DONE
 
 
-def audit_each(asked: Sequence[Path], begins: Callable[[Path], None] = lambda path: None) -> Iterator[Audited]:
-    """Recordings, folders of recordings, and patterns, in the order in which
-    they are given, each recording once; ``begins`` is called before each."""
-    seen: set[Path] = set()
+def to_audit(asked: Sequence[Path]) -> list[Path | Audited]:
+    """Recordings, folders of recordings, and patterns, in the order in which they are
+    given, each recording once. What names no recording is its own error."""
+    found: dict[Path | str, Path | Audited] = {}
     for given in asked:
         try:
-            paths = _recordings_of(given)
+            found |= {path: path for path in _recordings_of(given) if path not in found}
         except InputError as e:
-            yield Audited(str(given), None, str(e), exit_code_of(e))
-            continue
-        for path in paths:
-            if path not in seen:
-                seen.add(path)
-                begins(path)
-                yield _audited(path)
+            found[str(given)] = Audited(str(given), None, str(e), exit_code_of(e))
+    return list(found.values())
+
+
+def audit_each(of: Iterable[Path | Audited], begins: Callable[[Path], None] = lambda path: None) -> Iterator[Audited]:
+    """Audit what `to_audit` found; ``begins`` is called before each recording."""
+    for one in of:
+        if isinstance(one, Audited):
+            yield one
+        else:
+            begins(one)
+            yield _audited(one)
 
 
 def worst(of: Iterable[Audited]) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from math import ceil, floor, log10
 from typing import Any
 
+import triaxcal as tc
 from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
 from triaxcald.audit.figures import SHARE, Agreement
@@ -156,13 +157,23 @@ def _where(of: Audit) -> str:
 
 def summary(of: Sequence[Audited]) -> str:
     """ "12 recordings: 10 agree, 1 differs, 1 could not be audited"."""
+    return f"{tc.number_format.number_of(len(of), 'recording')}: {_told(of)}"
+
+
+def stopped(of: Sequence[Audited], total: int) -> str:
+    """ "12 of 40 recordings audited: 11 agree, 1 differs"."""
+    told = f": {_told(of)}" if of else ""
+    return f"{len(of)} of {tc.number_format.number_of(total, 'recording')} audited{told}"
+
+
+def _told(of: Sequence[Audited]) -> str:
     counts = _counted(of)
     told = [f"{counts['agree']} agree{'s' if counts['agree'] == 1 else ''}"]
     if counts["differ"]:
         told.append(f"{counts['differ']} differ{'s' if counts['differ'] == 1 else ''}")
     if counts["unreadable"]:
         told.append(f"{counts['unreadable']} could not be audited")
-    return f"{len(of)} recording{'' if len(of) == 1 else 's'}: {', '.join(told)}"
+    return ", ".join(told)
 
 
 def counts(of: Sequence[Audited]) -> dict[str, int]:

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 
 import triaxcal as tc
 import triaxcal_drivers as td
+from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.cli.console import at, emit, say, show
 from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
@@ -29,19 +30,22 @@ from triaxcald.tables.native_csv import Rows, write_csv
 
 
 def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import audit_each, text, worst  # the whole line, which no `log` needs
+    from triaxcald.audit import Audited, audit_each, text, to_audit, worst  # the whole line, which no `log` needs
 
-    audited = []
-    for one in audit_each(a.recordings, lambda path: at(f"auditing {path}")):
-        audited.append(one)
-        if one.audit is None:
-            say(f"triaxcal: {one.error}")
-        elif not a.json:
-            show(text.heading(one.audit))
-            for line in map(text.difference, one.audit.differences):
-                show(f"  {line}")
-            for line in text.notes(one.audit.notes):
-                show(f"  note: {line}")
+    asked = to_audit(a.recordings)
+    audited: list[Audited] = []
+    with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
+        for one in audit_each(asked, lambda path: at(f"auditing {path}")):
+            audited.append(one)
+            if one.audit is None:
+                say(f"triaxcal: {one.error}")
+            elif not a.json:
+                show(text.heading(one.audit))
+                for line in map(text.difference, one.audit.differences):
+                    show(f"  {line}")
+                for line in text.notes(one.audit.notes):
+                    show(f"  note: {line}")
+                sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
     if a.json:
         emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
               "summary": text.counts(audited)})  # fmt: skip

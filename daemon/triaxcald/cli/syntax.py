@@ -19,6 +19,7 @@ import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.printable import printable
+from triaxcald.schema.codes import Code
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
 from triaxcald.work import wrong
 
@@ -358,6 +359,29 @@ def _line(commands: Any) -> None:
         "--metrics", type=port, metavar="PORT", help="numbers for Prometheus and a health page on the loopback"
     )
     p.add_argument("--log-format", choices=("text", "json"), default="text", help="of progress; json: an object a line")
+    p = _command(
+        commands, "results", "runs:results_command", "one row for each run in a station's folder",
+        "Shows the runs, or writes them with all their columns to a table.",
+        "results out --since 2026-01-01 -o runs.csv",
+    )  # fmt: skip
+    p.add_argument("folder", metavar="FOLDER", type=Path)
+    p.add_argument(
+        "--since", metavar="TIME", help="runs that began at or after this date or time: ISO 8601, UTC without an offset"
+    )
+    p.add_argument("--until", metavar="TIME", help="runs that began before this time, or on or before this date")
+    p.add_argument("--serial", help="runs of this serial number, reported or expected")
+    p.add_argument("--code", type=_code, metavar="CODE", help="runs that ended with this code, as fit_outside")
+    p.add_argument("-o", "--output", type=Path, metavar="TABLE", help=".csv, .csv.gz or .parquet")
+    add_json(p)
+
+
+def _code(text: str) -> str:
+    try:
+        return str(Code(text))
+    except ValueError:
+        close = td.hints.closest(text, map(str, Code))
+        hint = f"did you mean {close}?" if close else f"there are {', '.join(Code)}"
+        raise argparse.ArgumentTypeError(f"no code '{text}'; {hint}") from None
 
 
 def _add_work(p: argparse.ArgumentParser) -> None:

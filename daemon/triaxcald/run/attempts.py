@@ -22,7 +22,7 @@ from triaxcald import text
 from triaxcald.documents import to_text
 from triaxcald.errors import DiskError, InputError, RecordingError
 from triaxcald.files import synchronise, write_durably, write_new, write_text
-from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, Code, Ending, History, Papers, outcome_document
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, Code, Ending, Papers, outcome_document
 from triaxcald.provision.journal import open_journal
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
@@ -30,6 +30,7 @@ from triaxcald.recording.recover import Sealed, recover
 from triaxcald.recording.survey import survey
 from triaxcald.software import software
 from triaxcald.station.config import Station
+from triaxcald.store import History
 from triaxcald.work import Attempt, Work
 
 try:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from triaxcald.errors import InputError
-from triaxcald.outcome import History
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.config import Rules, Station
+from triaxcald.store import History
 from triaxcald.work import Work
 
 
@@ -55,7 +55,7 @@ def works(station: Station, given: Mapping[str, str | None]) -> dict[str, Work]:
 
 
 def require_serial(rules: Rules, serial: str, slot: str) -> None:
-    """Raises InputError if the serial number has not the form that the rules ask for."""
+    """Raises InputError if the serial number does not match the rule."""
     if rules.serial is not None and not re.fullmatch(rules.serial, serial):
         raise InputError(f"unit {slot}: serial number {serial}: rules.serial expects {rules.serial}")
 

@@ -22,7 +22,6 @@ from triaxcald.outcome import (
     SUFFIX,
     Code,
     Ending,
-    History,
     Papers,
     outcome_document,
     registers_told,
@@ -47,6 +46,7 @@ from triaxcald.software import new_run_id, software
 from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
+from triaxcald.store import History
 from triaxcald.work import Attempt, Work
 
 
@@ -196,9 +196,6 @@ class ProvisionRun:
     def _document(self, ending: Ending) -> tc.interchange.Document:
         p = self.provisioning
         history = History.of(self.station.folder, p.identity.serial) if p else History()
-        work = self._attempt.work
-        if p is not None and p.identity.serial is not None:
-            work = replace(work, attempt=history.attempts + 1)
         settles = p.settles if p is not None and p.settled and not self.dry_run else None
         return outcome_document(
             ending,
@@ -212,7 +209,7 @@ class ProvisionRun:
             supersedes=history.latest,
             journal=str(self._open_journal) if self._open_journal else None,
             forced=self.force if self.warnings else None,
-            attempt=replace(self._attempt, work=work, settles=settles),
+            attempt=replace(self._attempt, settles=settles),
         )
 
     def _write(self, document: tc.interchange.Document) -> Path:

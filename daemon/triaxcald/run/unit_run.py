@@ -33,7 +33,6 @@ from triaxcald.outcome import (
     SUFFIX,
     Code,
     Ending,
-    History,
     Papers,
     Verdict,
     digest_of,
@@ -63,6 +62,7 @@ from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.station.tray import Tray
+from triaxcald.store import History
 from triaxcald.verification import Verification, fitted_attitudes
 from triaxcald.work import RECORD as WORK_RECORD
 from triaxcald.work import Attempt, Work

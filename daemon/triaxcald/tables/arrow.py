@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ MOSTLY = 0.5
 """A column of which at least this share of the cells are numbers is one of
 numbers, and a cell without one a fault; else it is one of texts."""
 DAY_NS = 86_400 * 10**9
+ROWS_AT_ONCE = 5000
+"""Rows of a table that are in memory while it is written."""
 BYTES_MOST = 2**30
 """Of a Parquet file's values as they are stored, before compression; in memory
 they take a few times as much."""
@@ -340,6 +343,23 @@ def write_parquet(path: Path, blocks: Iterable[Rows], start_ns: int | None = Non
         if writer is not None:
             writer.close()
     return samples
+
+
+def write_rows(path: Path, types: Mapping[str, type], rows: Iterable[Sequence[Any]]) -> None:
+    """Rows of cells of these types (str, int, float), None for a gap. ``path`` is
+    overwritten. Raises OSError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+    schema = pa.schema([(name, kinds[of]) for name, of in types.items()])
+    waiting = iter(rows)
+    with pq.ParquetWriter(path, schema) as writer:
+        while block := list(islice(waiting, ROWS_AT_ONCE)):
+            columns = [
+                pa.array(column, field.type) for column, field in zip(zip(*block, strict=True), schema, strict=True)
+            ]
+            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
 def _array(values: Any) -> pa.Array:

@@ -93,6 +93,27 @@ with files.new_file(Path(sys.argv[1])): pass
     assert path.read_text() == "old"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [INT, TERM])
+@pytest.mark.parametrize("options", [[], ["--json"]], ids=["lines", "json"])
+def test_an_audit_that_is_stopped_says_how_far_it_came(tmp_path: Path, number: int, options: list[str]) -> None:
+    """The third of five files strikes; the first does not exist, the second is no recording."""
+    names = ["none.mcap", "text.mcap", "strikes.mcap", "d.mcap", "e.mcap"]
+    for name in names[1:]:
+        (tmp_path / name).write_text("no recording")
+    code = f"""
+from triaxcald.audit import many
+from triaxcald.cli.commands import main
+true = many.audit
+many.audit = lambda path: raise_signal({number:d}) if path.name == "strikes.mcap" else true(path)
+main(["audit", *sys.argv[1:]])
+"""
+    done = _python(code, *options, *(tmp_path / name for name in names))
+    assert (done.returncode, done.stdout) == (130, "")
+    last = done.stderr.splitlines()[-1]
+    assert last == "triaxcal: interrupted; 2 of 5 recordings audited: 0 agree, 2 could not be audited"
+
+
 def test_a_third_signal_ends_work_that_does_not_end() -> None:
     done = _python(DEAF + "run_interruptible(deaf())")
     assert done.returncode == 130
