@@ -10,13 +10,16 @@ from collections.abc import Iterator
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
+
+from pydantic import TypeAdapter
 
 import triaxcal as tc
 from triaxcald.documents import to_text
 from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
-from triaxcald.schema.codes import Code, Verdict
+from triaxcald.schema.codes import Code, Stage, Verdict
+from triaxcald.schema.event import KINDS, Event, Head
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.results import Results
 from triaxcald.schema.run import Demo, Run
@@ -110,7 +113,7 @@ VERIFICATION = """
 """  # noqa: E501
 OUTCOME = """# Outcome
 
-`triaxcal run`, `provision` and `restore` end with one document, `triaxcal.outcome/1`. It says what became of the unit and what the device holds. A recording has it as its last attachment, `outcome.json`; the same bytes lie beside it as `UNIT-SERIAL-TIME.outcome.json`. `provision` and `restore` write `SERIAL-TIME.outcome.json` into the station's folder. With `--json` it stands under `units[].outcome` of `triaxcal.run/1` and under `outcome` of `triaxcal.provisioning/1` and `triaxcal.restoration/1`, with its path in `outcome_file`. An outcome is never edited: a rework writes another that names this one. If the device was not reached, or its registers were not read, there is no file. After a third signal there is none, and standard error says what the device holds.
+`triaxcal run`, `provision` and `restore` end with one document, `triaxcal.outcome/1`. It says what became of the unit and what the device holds. A recording has it as its last attachment, `outcome.json`; the same bytes lie beside it as `UNIT-SERIAL-TIME.outcome.json`. `provision` and `restore` write `SERIAL-TIME.outcome.json` into the station's folder. With `--json` it stands under `units[].outcome` of `triaxcal.run/1` and under `outcome` of `triaxcal.provisioning/1` and `triaxcal.restoration/1`, with its path in `outcome_file`. An outcome is never edited: a rework writes another that names this one. `run` leaves one for every attempt: without a recording it is `SLOT-SERIAL-TIME.outcome.json`, with `recording` `null`. If the process was killed, or stopped by a third signal, the next start in the folder mends the recording and writes the outcome, with the code `killed`; until then `running/` in the folder has a file for the attempt. `provision` and `restore` leave none if the device was not reached or its registers were not read.
 
 Made from the model in `daemon/triaxcald/schema/outcome.py` by `docs/reference/documents.py`; [JSON Schema](outcome.schema.json).
 
@@ -132,6 +135,15 @@ DEMO = """
 The units are simulated ones. Besides the keys of a run:
 
 """
+EVENT = """# Events
+
+`triaxcal run --events` prints one `triaxcal.event/1` a line, on standard output, as the work goes on ([how to use them](../how-to/use-from-openhtf-or-pytest.md)). A program ignores keys and events that it does not know.
+
+Made from the models in `daemon/triaxcald/schema/event.py` by `docs/reference/documents.py`; [JSON Schema](event.schema.json).
+
+## Every event
+
+"""  # noqa: E501
 RESULTS = """# Results
 
 `triaxcal results FOLDER --json` prints `triaxcal.results/1`. A table (`-o`) has the keys of `runs` as columns, an empty cell for `null`, and `terms` in one cell, separated by `; `. Table `run` of the [index](../how-to/run-as-a-service.md#results-of-all-runs) has the same columns.
@@ -148,7 +160,8 @@ Before the first write the journal is on the disk, with what the device held and
 
 def pages() -> dict[Path, str]:
     """The text of each page by its path."""
-    made = {HERE / f"{name}.schema.json": _json_schema(model) for name, model in MODELS.items()}
+    made = {HERE / f"{name}.schema.json": _json_schema(model.model_json_schema()) for name, model in MODELS.items()}
+    made[HERE / "event.schema.json"] = _json_schema(TypeAdapter(Event).json_schema())
     texts = {
         "poses": POSES + _keys(tc.schema.Poses),
         "calibration": CALIBRATION + _keys(tc.schema.Calibration) + METHODS,
@@ -156,6 +169,7 @@ def pages() -> dict[Path, str]:
         "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
         "outcome": _outcome(),
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),
+        "event": _event(),
         "results": RESULTS + _keys(Results),
     }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
@@ -185,9 +199,17 @@ def _outcome() -> str:
     )
 
 
-def _json_schema(model: type[tc.schema.Model]) -> str:
+def _event() -> str:
+    parts = [EVENT, _keys(Head), "\n## Stages\n\n", _words("stage", Stage)]
+    for kind in KINDS:
+        name = get_args(kind.model_fields["event"].annotation)[0]
+        parts += [f"\n## `{name}`\n\n{kind.__doc__}\n\n", _keys(kind, but=Head)]
+    return "".join(parts)
+
+
+def _json_schema(schema: dict[str, Any]) -> str:
     """The links in descriptions are those of the page, and stay there."""
-    document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
+    document = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
     return LINK.sub(r"\1", to_text(document))
 
 

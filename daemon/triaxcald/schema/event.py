@@ -25,7 +25,9 @@ class Head(tc.schema.Model):
 
 
 class StageEvent(Head):
-    event: Literal["stage"]
+    """A stage of the work on a unit begins."""
+
+    event: Annotated[Literal["stage"], Field(description="kind of the event")]
     stage: Annotated[tc.schema.Word[Stage], Field(description="stage of the work that begins")]
 
 
@@ -36,14 +38,18 @@ class NextPose(tc.schema.Model):
 
 
 class PosesEvent(Head):
-    event: Literal["poses"]
+    """The poses of a unit, or its next pose, have changed."""
+
+    event: Annotated[Literal["poses"], Field(description="kind of the event")]
     found: Annotated[int, Field(description="distinct poses so far")]
     wanted: Annotated[int, Field(description="distinct poses that are wanted")]
     next: Annotated[NextPose | None, Field(description="the next pose; `null` if any other pose will do, or none")]
 
 
 class InstructionEvent(Head):
-    event: Literal["instruction"]
+    """The next pose of a fixture that turns all units."""
+
+    event: Annotated[Literal["instruction"], Field(description="kind of the event")]
     label: Annotated[str, Field(description="the pose in the fixture's own face names")]
     face: Annotated[str | None, Field(description="face of the fixture that points up; `null` off the faces")]
     vector: Annotated[Vector, Field(description="direction of up in the fixture's axes, of length 1")]
@@ -51,23 +57,32 @@ class InstructionEvent(Head):
 
 
 class LostEvent(Head):
-    event: Literal["lost"]
+    """A unit is lost, and waited for."""
+
+    event: Annotated[Literal["lost"], Field(description="kind of the event")]
     code: Annotated[tc.schema.Word[Code], Field(description="reason for programs")]
     reason: Annotated[tc.schema.Text, Field(description="reason for people, one line")]
 
 
 class BackEvent(Head):
-    event: Literal["back"]
+    """A lost unit is back."""
+
+    event: Annotated[Literal["back"], Field(description="kind of the event")]
 
 
 class EndedEvent(Head):
-    event: Literal["ended"]
+    """A unit has ended."""
+
+    event: Annotated[Literal["ended"], Field(description="kind of the event")]
     outcome: Annotated[Outcome, Field(description="the [`triaxcal.outcome/1`](outcome.md)")]
 
 
 class TrayEvent(Head):
-    event: Literal["tray"]
+    """All units that were started together."""
+
+    event: Annotated[Literal["tray"], Field(description="kind of the event")]
     state: Annotated[Literal["started", "ended"], Field(description="whether the tray has started or ended")]
 
 
+KINDS = (StageEvent, PosesEvent, InstructionEvent, LostEvent, BackEvent, EndedEvent, TrayEvent)
 Event = StageEvent | PosesEvent | InstructionEvent | LostEvent | BackEvent | EndedEvent | TrayEvent
