@@ -255,7 +255,7 @@ async def _serve(tray: Tray, source: Source | None) -> None:
     from triaxcald.station.simulators import Simulator, announced
 
     async with AsyncExitStack() as stack:
-        simulators = []
+        simulators, lines = [], []
         for described, simulated in zip(tray.described, tray.units, strict=True):
             server = await stack.enter_async_context(simulated.serve())
             await stack.enter_async_context(keep_eeprom(simulated.unit, described.eeprom))
@@ -264,8 +264,10 @@ async def _serve(tray: Tray, source: Source | None) -> None:
             simulators.append(Simulator.of(described.path, serial, reached))
             bus = {**device.bus, **({"port": reached.port} if "port" in device.bus else {})}
             settings = ", ".join(f"{k}={v}" for k, v in bus.items())
-            say(f"serving {simulated.bundle.profile.name}, serial {serial}, on {settings}; Ctrl-C stops it")
+            lines.append(f"serving {simulated.bundle.profile.name}, serial {serial}, on {settings}; Ctrl-C stops it")
         stack.enter_context(announced(simulators))
+        for line in lines:
+            say(line)
         if tray.operator is None or source is None:
             await asyncio.Event().wait()
             return

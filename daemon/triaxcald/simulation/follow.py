@@ -129,7 +129,7 @@ async def follow(
     def take(whole: list[bytes]) -> None:
         for line in whole:
             if line.strip() and not operator.read(line, time_base.now_s()) and _is_told(operator.ignored):
-                say(f"{source.name}: no event of a run, ignored (line {operator.ignored} of this kind)")
+                say(f"{source.name}: a line that is no event of a run is ignored, {operator.ignored} so far")
 
     def come(data: bytes | None) -> None:
         if data is not None:
@@ -137,7 +137,7 @@ async def follow(
             return
         take(lines.rest())
         operator.ended(time_base.now_s())
-        say(f"{source.name}: the events have ended, {operator.ignored} lines ignored; the fixture stays as it is")
+        say(f"{source.name}: the events have ended, {operator.ignored} lines were ignored; the units are served on")
 
     def tell(data: bytes | None) -> None:
         with suppress(RuntimeError):  # the loop has ended

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ def event(kind: str, unit: str | None = None, tray: str = "t1", **keys: Any) -> 
     return json.dumps({**head, "tray": tray, "unit": unit, "event": kind, **keys}).encode()
 
 
-def instruction(up: np.ndarray, tray: str = "t1") -> bytes:
-    return event("instruction", tray=tray, label="A", face=None, vector=up.tolist(), slots=["left"])
+def instruction(up: Sequence[float] | np.ndarray, tray: str = "t1") -> bytes:
+    return event("instruction", tray=tray, label="A", face=None, vector=[float(v) for v in up], slots=["left"])
 
 
 def poses(unit: str, up: np.ndarray | None, found: int = 0, wanted: int = 9, tray: str = "t1") -> bytes:
@@ -224,8 +225,9 @@ NO_EVENTS = [
     HEAD + b"7}",
     HEAD + b'"instruction"}',
     *(HEAD + b'"instruction", "vector": ' + v + b"}" for v in (
-        b"7", b"[1, 0]", b"[1, 0, 0, 0]", b"[0, 0, 0]", b'["1", 0, 0]', b"[NaN, 0, 1]", b"[1e999, 0, 0]", b"[true, 0, 0]",
-        b"[1" + b"0" * 400 + b", 0, 0]",
+        b"7", b"[1, 0]", b"[1, 0, 0, 0]", b"[0, 0, 0]",
+        b'["1", 0, 0]', b"[NaN, 0, 1]", b"[1e999, 0, 0]", b"[true, 0, 0]",
+        b"[1" + 400 * b"0" + b", 0, 0]",
     )),
     HEAD + b'"poses", "found": 1, "wanted": 2, "next": 3}',
     HEAD + b'"poses", "found": null, "wanted": 2, "next": null}',
