@@ -36,7 +36,7 @@ Ctrl-C, SIGTERM and SIGHUP interrupt every command with one line and no file lef
 
 ## One command at a device
 
-`run`, `record`, `provision`, `restore`, `registers` and `demo` lock the device, and on a serial line the whole port, against other commands on this machine. The second command ends with exit code 4 and names the first; `record -o FOLDER` waits instead. Other units of one gateway or bus stay free; listening to a bus and `sim` lock nothing. The lock ends with its process. Its files are in `/run/lock`, else in `/tmp`; `TRIAXCAL_LOCK_FOLDER` names another folder for all commands, as for containers and a read-only root. [Why](../decisions/0035-one-command-at-a-device.md).
+`run`, `record`, `provision`, `restore`, `registers` and `demo` lock the device, and on a serial line the whole port, against other commands on this machine. The second command ends with exit code 4 and names the first; `record -o FOLDER` waits instead. Other units of one gateway or bus stay free; listening to a bus and `sim` lock nothing, but `sim` leaves word there of its units, for the error about a wrong one. The lock ends with its process. Its files are in `/run/lock`, else in `/tmp`; `TRIAXCAL_LOCK_FOLDER` names another folder for all commands, as for containers and a read-only root. [Why](../decisions/0035-one-command-at-a-device.md).
 
 A result (`-o`, `--report`, the files of `run`) is written whole or not at all, and through no symbolic link (exit 2). Pipes, `/dev/null`, `/dev/stdout` and `/dev/fd/N` are written to as they are.
 

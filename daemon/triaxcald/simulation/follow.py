@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from triaxcald.errors import InputError
+from triaxcald.printable import printable
 from triaxcald.simulation.operating import Operator
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import ReferenceUnit
@@ -123,13 +124,18 @@ async def follow(
     say: Callable[[str], None],
 ) -> None:
     """Let the operator do what the events say, for ever. ``say`` is told of ignored
-    lines, and of the end of the events."""
+    lines, of slots that are not here, and of the end of the events."""
     loop, lines = asyncio.get_running_loop(), Lines()
 
     def take(whole: list[bytes]) -> None:
+        known = len(operator.strangers)
         for line in whole:
             if line.strip() and not operator.read(line, time_base.now_s()) and _is_told(operator.ignored):
                 say(f"{source.name}: a line that is no event of a run is ignored, {operator.ignored} so far")
+        for slot in operator.strangers[known:]:
+            say(
+                f"{source.name}: no unit here has the slot {printable(slot)}; the slots are {', '.join(operator.mounted)}"
+            )
 
     def come(data: bytes | None) -> None:
         if data is not None:

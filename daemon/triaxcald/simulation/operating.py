@@ -199,6 +199,8 @@ class Operator:
     first: tc.Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     ignored: int = field(default=0, init=False)
     """Lines that were no events."""
+    strangers: list[str] = field(default_factory=list, init=False)
+    """Slots that events named and that no unit here has."""
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
@@ -240,6 +242,8 @@ class Operator:
 
     def _take(self, event: _Event, t_s: float) -> None:
         slot = event.unit if event.unit in self.mounted else None
+        if event.unit is not None and event.unit not in (slot, *self.strangers):
+            self.strangers.append(event.unit)
         match event.kind:
             case "instruction":
                 self._instructed(event, _direction(event.held.get("vector")), t_s)
@@ -251,7 +255,7 @@ class Operator:
                 self._tasks[slot] = _Task()
                 self._lacking.pop(slot, None)
                 self._supply(slot, True, t_s)
-            case "tray" if event.held.get("state") == "ended":
+            case "tray":  # a new one too: the run before it may have been killed
                 self._rest(t_s)
 
     def _instructed(self, event: _Event, direction: tc.Floats, t_s: float) -> None:

@@ -205,7 +205,7 @@ def test_supplies_are_switched_after_the_reaction_time_one_unit_at_a_time() -> N
     assert operator.due(1e9) == []
 
 
-@pytest.mark.parametrize("end", ["ended", "tray", "stream"])
+@pytest.mark.parametrize("end", ["ended", "tray", "another tray", "stream"])
 def test_no_unit_stays_without_supply_after_its_run(end: str) -> None:
     operator = Operator(MOUNTED, NEVER_WRONG)
     operator.read(stage("right", "power_off"), 0.0)
@@ -213,6 +213,8 @@ def test_no_unit_stays_without_supply_after_its_run(end: str) -> None:
         operator.read(event("ended", "right", outcome={}), 0.5)
     elif end == "tray":
         operator.read(event("tray", state="ended"), 0.5)
+    elif end == "another tray":
+        operator.read(event("tray", tray="t2", state="started"), 0.5)
     else:
         operator.ended(0.5)
     assert operator.due(2.0) == [Switch("right", on=False), Switch("right", on=True)]
@@ -262,6 +264,13 @@ def test_an_event_that_tells_an_operator_nothing_is_no_fault(line: bytes) -> Non
     assert operator.read(line, 0.0)
     assert operator.due(100.0) == []
     assert all(path.turns == 0 for path in operator.paths.values())
+
+
+def test_a_slot_that_no_unit_has_is_kept_for_the_operator_of_the_program() -> None:
+    operator = Operator(MOUNTED, NEVER_WRONG)
+    for slot in ("left", "third", "third", "fourth"):
+        operator.read(poses(slot, X), 0.0)
+    assert operator.strangers == ["third", "fourth"]
 
 
 def test_the_pose_before_is_the_one_that_was_left() -> None:

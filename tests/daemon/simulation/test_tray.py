@@ -188,6 +188,9 @@ async def test_a_stream_that_ends_leaves_the_units_as_they_are_and_served(worksh
     said: list[str] = []
     ended = asyncio.Event()
 
+    def asked(up: np.ndarray) -> bytes:
+        return poses("third", up) + b"\n" + poses("left", ORIENTATIONS[MOUNTINGS["left"]] @ up)
+
     def say(line: str) -> None:
         said.append(line)
         if "ended" in line:
@@ -195,11 +198,12 @@ async def test_a_stream_that_ends_leaves_the_units_as_they_are_and_served(worksh
 
     following = asyncio.create_task(follow(Source(str(events)), tray.operator, {}, tray.time_base, say))
     for turn, v in enumerate(ASKED[:2], start=1):  # a run, and the next one
-        await asyncio.to_thread(events.write_bytes, b"junk\n" + poses("left", ORIENTATIONS[MOUNTINGS["left"]] @ v))
+        await asyncio.to_thread(events.write_bytes, b"junk\n" + asked(v))
         await ended.wait()
         ended.clear()
         assert (tray.operator.ignored, tray.operator.paths["left"].turns) == (turn, turn)
-        assert len(said) == 2 * turn
+        assert len(said) == 2 * turn + 1
+        assert "no unit here has the slot third; the slots are left, right" in said[1]
         arrived_s = tray.time_base.now_s() + 5.0
         assert angle_deg(tray.operator.paths["left"].specific_force(np.array([arrived_s]))[0], v) < 25
         await tray.time_base.wait_until(arrived_s)
