@@ -132,10 +132,8 @@ async def follow(
         for line in whole:
             if line.strip() and not operator.read(line, time_base.now_s()) and _is_told(operator.ignored):
                 say(f"{source.name}: a line that is no event of a run is ignored, {operator.ignored} so far")
-        for slot in operator.strangers[known:]:
-            say(
-                f"{source.name}: no unit here has the slot {printable(slot)}; the slots are {', '.join(operator.mounted)}"
-            )
+        for slot in map(printable, operator.strangers[known:]):
+            say(f"{source.name}: no unit here has the slot {slot}; the slots are {', '.join(operator.mounted)}")
 
     def come(data: bytes | None) -> None:
         if data is not None:
