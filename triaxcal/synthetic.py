@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -21,6 +22,21 @@ COVARIATES = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_ST
 """What an effect of a synthetic unit may go with."""
 
 
+class Path(Protocol):
+    """The attitude of a unit over time."""
+
+    def specific_force(self, t_s: Floats) -> Floats:
+        """a (n,3) in g at times (n,) from the start."""
+
+    def before(self, t_s: Floats) -> Floats:
+        """a (n,3) in g in the pose before, that at times (n,) is held or left;
+        that of the first pose itself in it."""
+
+
+LEVER_M = 0.1
+"""Of a sensor in the middle of a unit that a hand turns about its edge."""
+
+
 @dataclass(frozen=True)
 class Tumble:
     """A path from pose to pose, for ever: ``hold_s`` still in each direction,
@@ -34,7 +50,7 @@ class Tumble:
     directions: Floats
     hold_s: float
     move_s: float
-    lever_m: float = 0.1
+    lever_m: float = LEVER_M
 
     @property
     def step_s(self) -> float:
@@ -60,18 +76,27 @@ class Tumble:
     def specific_force(self, t_s: Floats) -> Floats:
         """a (n,3) in g at times (n,) from the start."""
         step = self._step(t_s)
-        here, there = self.taken(step), self.taken(step + 1)
-        x = np.clip((t_s - step * self.step_s - self.hold_s) / self.move_s, 0.0, 1.0)
-        angle = np.arccos(np.clip(np.sum(here * there, axis=1), -1.0, 1.0))
-        across = _square(here, there)
-        turned = angle * (10 * x**3 - 15 * x**4 + 6 * x**5)
-        rate = angle * (30 * x**2 - 60 * x**3 + 30 * x**4) / self.move_s
-        acceleration = angle * (60 * x - 180 * x**2 + 120 * x**3) / self.move_s**2
-        along = np.cos(turned)[:, None] * here + np.sin(turned)[:, None] * across
-        tangent = -np.sin(turned)[:, None] * here + np.cos(turned)[:, None] * across
-        lever_g = self.lever_m / STANDARD_GRAVITY
-        a: Floats = along * (1 - lever_g * rate**2)[:, None] + tangent * (lever_g * acceleration)[:, None]
-        return a
+        x = (t_s - step * self.step_s - self.hold_s) / self.move_s
+        return turn(self.taken(step), self.taken(step + 1), x, self.move_s, self.lever_m)
+
+
+def turn(here: Floats, there: Floats, x: Floats, move_s: float, lever_m: float = LEVER_M) -> Floats:
+    """a (n,3) in g on the way from the directions ``here`` to ``there`` (n,3), after
+    the shares ``x`` (n,) of ``move_s``: below 0 here, above 1 there.
+
+    The way is the shortest arc with a minimum-jerk profile; ``lever_m`` as in `Tumble`.
+    """
+    x = np.clip(x, 0.0, 1.0)
+    angle = np.arccos(np.clip(np.sum(here * there, axis=1), -1.0, 1.0))
+    across = _square(here, there)
+    turned = angle * (10 * x**3 - 15 * x**4 + 6 * x**5)
+    rate = angle * (30 * x**2 - 60 * x**3 + 30 * x**4) / move_s
+    acceleration = angle * (60 * x - 180 * x**2 + 120 * x**3) / move_s**2
+    along = np.cos(turned)[:, None] * here + np.sin(turned)[:, None] * across
+    tangent = -np.sin(turned)[:, None] * here + np.cos(turned)[:, None] * across
+    lever_g = lever_m / STANDARD_GRAVITY
+    a: Floats = along * (1 - lever_g * rate**2)[:, None] + tangent * (lever_g * acceleration)[:, None]
+    return a
 
 
 def _square(here: Floats, there: Floats) -> Floats:
@@ -118,7 +143,7 @@ class SyntheticUnit:
     (`COVARIATES`)."""
 
     sensor: Sensor
-    path: Tumble
+    path: Path
     noise_g: Floats
     environment: Environment = field(default_factory=Environment)
     channel_reference: Mapping[str, float] = field(default_factory=lambda: {"temp_c": 25.0, TIME: 0.0})

@@ -8,7 +8,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AsyncExitStack, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
     from triaxcald.demo import DemoUnit
     from triaxcald.run.unit_run import Outcome
     from triaxcald.schema.run import UnitOfDemo, UnitOfRun
-    from triaxcald.simulation.bench import SimulatedUnit
+    from triaxcald.simulation.follow import Source
+    from triaxcald.simulation.tray import Tray
 
 
 def run_command(a: argparse.Namespace) -> int:
@@ -274,14 +275,18 @@ def _show_demo(u: DemoUnit) -> None:
 
 
 def sim_command(a: argparse.Namespace) -> int:
-    from triaxcald.simulation.bench import load_device, simulate
-    from triaxcald.simulation.unit import read_eeprom
+    from triaxcald.simulation.tray import load_tray
 
-    device = load_device(a.device)
-    eeprom = a.device.parent / device.eeprom if device.eeprom else None
-    simulated = simulate(device, where=str(a.device), stored=read_eeprom(eeprom) if eeprom else None)
+    source = None
+    if a.follow is not None:
+        from triaxcald.simulation.follow import Source
+
+        if a.follow.startswith(("http://", "https://")):
+            raise InputError(f"--follow {a.follow}: an address is not available yet, give a FILE or -")
+        source = Source(a.follow)
+    tray = load_tray(a.devices, followed=source is not None)
     try:
-        run_interruptible(_serve(simulated, eeprom))
+        run_interruptible(_serve(tray, source))
     except Interrupted as e:
         if e.number == signal.SIGINT:
             raise
@@ -289,13 +294,27 @@ def sim_command(a: argparse.Namespace) -> int:
     return 0
 
 
-async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
+async def _serve(tray: Tray, source: Source | None) -> None:
+    from triaxcald.simulation.follow import follow
     from triaxcald.simulation.unit import keep_eeprom
+    from triaxcald.station.simulators import Simulator, announced
 
-    async with simulated.serve() as server:
-        name, device = simulated.bundle.profile.name, simulated.device
-        bus = {**device.bus, **({"port": server.bus.port} if "port" in device.bus else {})}
-        settings = ", ".join(f"{k}={v}" for k, v in bus.items())
-        say(f"serving {name}, serial {device.serial:04d}, on {settings}; Ctrl-C stops it")
-        async with keep_eeprom(simulated.unit, eeprom):
+    async with AsyncExitStack() as stack:
+        simulators, lines = [], []
+        for described, simulated in zip(tray.described, tray.units, strict=True):
+            server = await stack.enter_async_context(simulated.serve())
+            await stack.enter_async_context(keep_eeprom(simulated.unit, described.eeprom))
+            device, reached = described.device, getattr(server, "bus", simulated.bus)
+            serial = f"{device.serial:04d}"
+            simulators.append(Simulator.of(described.path, serial, reached))
+            bus = {**device.bus, **({"port": reached.port} if "port" in device.bus else {})}
+            settings = ", ".join(f"{k}={v}" for k, v in bus.items())
+            lines.append(f"serving {simulated.bundle.profile.name}, serial {serial}, on {settings}; Ctrl-C stops it")
+        stack.enter_context(announced(simulators))
+        for line in lines:
+            say(line)
+        if tray.operator is None or source is None:
             await asyncio.Event().wait()
+            return
+        units = {d.slot: u.unit for d, u in zip(tray.described, tray.units, strict=True)}
+        await follow(source, tray.operator, units, tray.time_base, say)

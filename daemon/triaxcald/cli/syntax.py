@@ -327,9 +327,18 @@ def _line(commands: Any) -> None:
         "--events", action="store_true", help="one JSON object a line on standard output, as the work goes on"
     )
     p = _command(
-        commands, "sim", "stations:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
-    )
-    p.add_argument("device", metavar="DEVICE.toml", type=Path)
+        commands, "sim", "stations:sim_command", "serve simulated units on their buses until stopped",
+        "Several units are on one fixture, with one clock. It turns by itself; with --follow an operator turns it, who "
+        "does what a run says: after the reaction_s of a device file's [fixture], 1 s by default, and in 1 of 50 turns "
+        "to a wrong side.",
+        "sim can.toml modbus.toml --follow events.jsonl",
+    )  # fmt: skip
+    p.add_argument("devices", metavar="DEVICE.toml", type=Path, nargs="+")
+    p.add_argument(
+        "--follow", metavar="FILE|-",
+        help="turn the units and switch their supplies as the events of `run --events` say, from a file that grows, a "
+        "FIFO, or standard input",
+    )  # fmt: skip
     p = _command(
         commands, "record", "record:record_command", "record only",
         "A unit that is absent or lost is waited for; the gap is in the recording. A bus of the station is recorded "

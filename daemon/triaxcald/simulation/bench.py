@@ -1,5 +1,5 @@
-"""A simulated unit on a simulated tumble fixture: the file that describes it,
-its physics, its place on a bus."""
+"""A simulated unit on a simulated fixture: the file that describes it, its
+physics, its place on a bus."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.errors import InputError
+from triaxcald.mounting import ALIGNED, ORIENTATIONS
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 
@@ -44,14 +45,22 @@ still finds enough; and after so many restarts the first ones come again."""
 
 
 class Fixture(td.Strict):
-    """The tumble fixture: it goes through the poses of the plan, in its order,
-    the first once more, again and again; and after a restart of the unit once
-    through others, to check by."""
+    """The fixture. By itself it goes through the poses of the plan, in its order,
+    the first once more, again and again; and after a restart of a unit once
+    through others, to check by. Else an operator turns it, who follows a run."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(gt=0)] = 4.0
     move_s: Annotated[float, Field(gt=0)] = 1.5
     attitude_error_deg: Annotated[float, Field(ge=0, le=20)] = 2.0
+    reaction_s: Annotated[float, Field(ge=0, le=600, description="from an instruction to the operator's turn")] = 1.0
+    wrong_turns: Annotated[float, Field(ge=0, le=0.5, description="share of the operator's turns")] = 0.02
+
+
+def _one_of_24(name: str) -> str:
+    if name not in ORIENTATIONS:
+        raise ValueError(f"expected one of the 24 right-handed orientations, as {ALIGNED} or +y-x+z")
+    return name
 
 
 class DeviceFile(td.Strict):
@@ -65,10 +74,37 @@ class DeviceFile(td.Strict):
     eeprom: Annotated[
         str | None, Field(pattern=r"^[^\x00]+$", description="file that holds the EEPROM between runs")
     ] = None
+    slot: Annotated[str | None, Field(description="of the station that is followed; by default this file's stem")] = (
+        None
+    )
+    mounting: Annotated[str, AfterValidator(_one_of_24), Field(description="the unit's axes along the fixture's")] = (
+        ALIGNED
+    )
     bus: dict[str, Any]
     sensor: SensorTruth = SensorTruth()
     surroundings: Surroundings = Surroundings()
     fixture: Fixture = Fixture()
+
+
+class Turning(tc.synthetic.Path, Protocol):
+    """How a fixture turns, in its own axes."""
+
+    def restarted(self, t_s: float) -> None:
+        """A unit on it starts again, as after its registers were written."""
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """The turning in the axes of a unit; ``rotation`` is one of `ORIENTATIONS`."""
+
+    fixture: Turning
+    rotation: tc.Floats
+
+    def specific_force(self, t_s: tc.Floats) -> tc.Floats:
+        return np.asarray(self.fixture.specific_force(t_s) @ self.rotation.T)
+
+    def before(self, t_s: tc.Floats) -> tc.Floats:
+        return np.asarray(self.fixture.before(t_s) @ self.rotation.T)
 
 
 @dataclass(frozen=True)
@@ -97,7 +133,7 @@ class SyntheticPhysics:
     """Binds the metrology's synthetic unit to the simulated electronics."""
 
     unit: tc.synthetic.SyntheticUnit
-    fixture: CheckedTumble
+    fixture: Turning
 
     def sample(self, unit_time_s: Any) -> tuple[Any, Any]:
         return self.unit.sample(unit_time_s)
@@ -117,17 +153,19 @@ def load_device(path: Path) -> DeviceFile:
     )
 
 
-def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:
-    """Raises InputError where an effect is not known or not simulated;
-    ``where`` names the file in it."""
+def physics_of(device: DeviceFile, *, where: str = "device", fixture: Turning | None = None) -> SyntheticPhysics:
+    """On the ``fixture``, by default one of its own that turns by itself. Raises
+    InputError where an effect is not known or not simulated; ``where`` names the
+    file in it."""
     effects = [_effect(name, held, where) for name, held in device.sensor.effects.items()]
     truth = device.sensor
     sensor = tc.Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
     place = device.surroundings
     environment = tc.synthetic.Environment(place.temperature_c, place.ramp_c_per_s, place.swing_c, place.swing_period_s)
-    fixture = tumble_of(device)
+    fixture = tumble_of(device) if fixture is None else fixture
+    path = Mounted(fixture, ORIENTATIONS[device.mounting])
     return SyntheticPhysics(
-        tc.synthetic.SyntheticUnit(sensor, fixture, np.full(3, truth.noise_g), environment, seed=device.seed), fixture
+        tc.synthetic.SyntheticUnit(sensor, path, np.full(3, truth.noise_g), environment, seed=device.seed), fixture
     )
 
 
@@ -204,17 +242,25 @@ class SimulatedUnit:
         return ModbusUnit(self.unit, self.time_base, self.bus.where, unit_id=self.bus.unit_id)
 
 
-def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None) -> SimulatedUnit:
-    """Build the unit. Raises InputError, ProfileError."""
+def simulate(
+    device: DeviceFile,
+    *,
+    where: str,
+    stored: bytes | None = None,
+    fixture: Turning | None = None,
+    time_base: TimeBase | None = None,
+) -> SimulatedUnit:
+    """Build the unit; ``fixture`` and ``time_base`` are its own by default. Raises
+    InputError, ProfileError."""
     bundle = td.load_bundle(Path(device.profile))
     driver = td.driver_named(bundle.profile.driver, where=where)
     if bundle.profile.name not in ("triax-ref-can", "triax-ref-modbus"):
         raise InputError(f"{where}: profile: only triax-ref-can and triax-ref-modbus are simulated")
     bus = td.toml_text.validate(driver.bus_model, device.bus, b"", where=f"{where}: bus")
     unit = ReferenceUnit(
-        physics_of(device, where=where),
+        physics_of(device, where=where, fixture=fixture),
         serial_number=device.serial,
         stored=stored,
         rate_hz=bundle.profile.sampling.rate_hz,
     )
-    return SimulatedUnit(device, bundle, unit, ElasticTimeBase(device.speed), bus)
+    return SimulatedUnit(device, bundle, unit, time_base or ElasticTimeBase(device.speed), bus)

@@ -4,6 +4,7 @@ and FIFO windows."""
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
@@ -70,6 +71,9 @@ WINDOW_WORDS = HEADER_WORDS + RECORD_WORDS * WINDOW_RECORDS
 FIFO_RECORDS = 4096
 BEHIND_RECORDS = 10 * WINDOW_RECORDS
 """A reader that has left so many in a FIFO does not keep up with the unit."""
+GONE_S = 10.0
+"""A reader that has not read for so long has gone, and keeps no other unit of the
+fixture waiting: a quarter of the time in which the FIFO fills."""
 PTY = "pty:"
 _FILL_PERIOD_S = 1.0
 _CODES = {
@@ -112,12 +116,11 @@ class Fifo:
     def __init__(self) -> None:
         self._records = bytearray()
         self.lost = 0
-        self._read = False
+        self._read_s = -math.inf
 
-    @property
-    def behind(self) -> bool:
-        """Whether a reader has begun to fetch and does not keep up."""
-        return self._read and len(self) > BEHIND_RECORDS
+    def behind(self, unit_s: float) -> bool:
+        """Whether a reader fetches and does not keep up."""
+        return unit_s - self._read_s < GONE_S and len(self) > BEHIND_RECORDS
 
     def __len__(self) -> int:
         return len(self._records) // (2 * RECORD_WORDS)
@@ -128,10 +131,10 @@ class Fifo:
         del self._records[: excess * 2 * RECORD_WORDS]
         self.lost += excess
 
-    def window(self, words: int) -> bytes:
+    def window(self, words: int, unit_s: float) -> bytes:
         """The first ``words`` words of the window; takes out the records that
         lie in them whole."""
-        self._read = True
+        self._read_s = unit_s
         number = min(len(self), WINDOW_RECORDS, max(0, words - HEADER_WORDS) // RECORD_WORDS)
         taken = bytes(self._records[: number * 2 * RECORD_WORDS])
         del self._records[: len(taken)]
@@ -141,7 +144,7 @@ class Fifo:
     def clear(self) -> None:
         self._records.clear()
         self.lost = 0
-        self._read = False
+        self._read_s = -math.inf
 
 
 class ModbusMap:
@@ -153,12 +156,14 @@ class ModbusMap:
         self._time_base = time_base
         self._started_s = unit.started_s
         self._windows = {READINGS_WINDOW: Fifo(), CORRECTED_WINDOW: Fifo()}
-        time_base.wait_for_reader(lambda: any(fifo.behind for fifo in self._windows.values()))
+        self._filled_s = 0.0
+        time_base.wait_for_reader(lambda: any(fifo.behind(self._filled_s) for fifo in self._windows.values()))
 
     def fill(self) -> None:
         """Moves the samples that have come due into the FIFOs; empties these
         where the unit has restarted."""
-        run = self._unit.advance(self._time_base.now_s())
+        self._filled_s = self._time_base.now_s()
+        run = self._unit.advance(self._filled_s)
         if self._unit.started_s != self._started_s:
             self._started_s = self._unit.started_s
             for fifo in self._windows.values():
@@ -175,7 +180,7 @@ class ModbusMap:
         if function == td.modbus.READ_INPUT:
             if address not in self._windows or count > WINDOW_WORDS:
                 raise td.modbus.ModbusRefusal(td.modbus.ILLEGAL_ADDRESS)
-            return self._windows[address].window(count)
+            return self._windows[address].window(count, self._filled_s)
         words = []
         for at in range(address, address + count):
             if at not in _WORDS:

@@ -13,8 +13,8 @@ from typing import Protocol
 
 class TimeBase(Protocol):
     def wait_for_reader(self, behind: Callable[[], bool]) -> None:
-        """``behind`` says from now on whether much of what the unit has sent is
-        not fetched yet."""
+        """``behind`` says from now on whether much of what a unit has sent is not
+        fetched yet. Units that share the clock each say so."""
 
     def now_s(self) -> float:
         """Unit time in seconds; never goes back."""
@@ -62,7 +62,7 @@ class ElasticTimeBase:
     machine or reader do not keep up.
 
     It goes on by no more than ``step_s`` from one look to the next, so that a
-    process that was kept from looking has nothing to make up for; and while the
+    process that was kept from looking has nothing to make up for; and while a
     reader is behind no faster than the wall clock, so that nothing overflows
     that would not in real time. It does not stand still then: a unit that
     nobody reads still stores and restarts.
@@ -74,10 +74,10 @@ class ElasticTimeBase:
         self.speed, self.step_s = speed, step_s
         self._now_s = 0.0
         self._looked_s = time.monotonic()
-        self._behind: Callable[[], bool] = lambda: False
+        self._behind: list[Callable[[], bool]] = []
 
     def wait_for_reader(self, behind: Callable[[], bool]) -> None:
-        self._behind = behind
+        self._behind.append(behind)
 
     def now_s(self) -> float:
         looked_s = time.monotonic()
@@ -93,7 +93,7 @@ class ElasticTimeBase:
             await asyncio.sleep(min(left, self.step_s / 2) / self._rate())
 
     def _rate(self) -> float:
-        return min(self.speed, 1.0) if self._behind() else self.speed
+        return min(self.speed, 1.0) if any(behind() for behind in self._behind) else self.speed
 
 
 class SteppedTimeBase:

@@ -269,7 +269,7 @@ class ReferenceUnit:
     @property
     def started_s(self) -> float:
         """Unit time of sample 0 since the last start; changes with every
-        restart."""
+        restart. Infinite while the supply is off."""
         return self._started_s
 
     @property
@@ -284,8 +284,19 @@ class ReferenceUnit:
 
     def power_cycle(self, unit_time_s: float) -> None:
         """Power goes and comes back: what was not stored by now is lost."""
+        self.switch_off(unit_time_s)
+        self.switch_on(unit_time_s)
+
+    def switch_off(self, unit_time_s: float) -> None:
+        """The supply goes: silent until `switch_on`. What was not stored by now is
+        lost."""
         self._settle(unit_time_s)
-        self._start(unit_time_s + RESTART_S)
+        self._storing, self._started_s = None, math.inf
+
+    def switch_on(self, unit_time_s: float) -> None:
+        """The supply comes; nothing happens where it is there."""
+        if self._started_s == math.inf:
+            self._start(unit_time_s + RESTART_S)
 
     def read(self, name: str, unit_time_s: float) -> bytes:
         """A register's raw bytes, most significant first. Raises RegisterFault,
@@ -370,9 +381,11 @@ class ReferenceUnit:
         )
 
     def advance(self, unit_time_s: float) -> SampleRun:
-        """All samples due since the last call; none while the unit restarts or
-        once it is dead."""
+        """All samples due since the last call; none while the unit restarts or has no
+        supply, or once it is dead."""
         self._settle(unit_time_s)
+        if self._started_s == math.inf:
+            return self._take(np.arange(0))
         last_s = min(unit_time_s + _DUE_S, math.nextafter(self._died_s, -math.inf))
         due = max(self._next, math.floor((last_s - self._started_s) * self.rate_hz) + 1)
         counter = np.arange(self._next, due, dtype=np.int64)

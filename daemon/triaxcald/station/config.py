@@ -19,11 +19,13 @@ from pydantic import AfterValidator, BaseModel, FailFast, Field, ValidationInfo,
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald import work
-from triaxcald.errors import InputError, SerialTwice
-from triaxcald.provision.identity import same_serial
+from triaxcald.errors import InputError, SerialTwice, TwoAnswer
+from triaxcald.mounting import AXES, rotation
+from triaxcald.provision.identity import WrongUnit, same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
-from triaxcald.station.faces import AXES, OWN_NAMES, rotation
+from triaxcald.station.faces import OWN_NAMES
 from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
+from triaxcald.station.simulators import others_at
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -331,7 +333,8 @@ class Place:
         Raises DeviceInUse, BusError, DeviceAbsent and the errors of ``identify``.
         With ``policy`` these are retried first, DeviceInUse only if the policy says
         so; ``tell`` receives each error meanwhile. The claim stays if the device is
-        closed and opened in between, as a reset does.
+        closed and opened in between, as a reset does. Where another unit answers, the
+        error names the simulators of this machine at the place.
         """
         device = self.device()
 
@@ -344,6 +347,10 @@ class Place:
             try:
                 await (attempt() if policy is None else until_open(attempt, policy, tell))
                 yield device
+            except (WrongUnit, TwoAnswer) as e:
+                if others := others_at(self.bus, self.unit.serial):
+                    raise type(e)("; ".join([str(e), *map(str, others)])) from e
+                raise
             finally:
                 with suppress(td.DriverError):
                     await device.close()

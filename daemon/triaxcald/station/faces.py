@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 import triaxcal as tc
+from triaxcald.mounting import AXES, axis_vector
 
-AXES: Final = ("+x", "-x", "+y", "-y", "+z", "-z")
 OWN_NAMES: Final[Mapping[str, str]] = {axis: axis.upper() for axis in AXES}
 """Names of faces without a name of their own."""
 STEP_DEG = 5.0
@@ -19,29 +19,6 @@ STEP_DEG = 5.0
 pose may be off by `COVERED_DEG` of the guidance."""
 SAME_BEARING_DEG = 1.0
 """Of two names in the same bearing, to this, the one with fewer faces is told."""
-
-
-def rotation(mounting: str) -> tc.Floats:
-    """(3,3) matrix from the unit's axes to the fixture's, as ``+x+y+z`` or ``-y+x+z``
-    names them: the fixture's axes along which the unit's x, y, and z point.
-
-    Raises ValueError if these are not three axes or the unit would be a mirror
-    image.
-    """
-    axes = [mounting[i : i + 2] for i in range(0, len(mounting), 2)]
-    if len(axes) != 3 or not all(axis in AXES for axis in axes):
-        raise ValueError("expected three axes of the fixture, each with its sign, as in '+x+y+z'")
-    for axis in "xyz":
-        if mounting.count(axis) > 1:
-            raise ValueError(f"the fixture's {axis} axis is given twice, expected each axis once")
-    matrix = np.stack([_vector(axis) for axis in axes], axis=1)
-    if np.linalg.det(matrix) < 0:
-        raise ValueError("a mirror image, no rotation: expected right-handed axes, such as '+x+y+z'")
-    return matrix
-
-
-def _vector(axis: str) -> tc.Floats:
-    return np.where(np.array(list("xyz")) == axis[1], -1.0 if axis[0] == "-" else 1.0, 0.0)
 
 
 def turned(direction: tc.planning.Direction, matrix: tc.Floats) -> tc.planning.Direction:
@@ -77,7 +54,7 @@ def described(up: tc.Floats, names: Mapping[str, str] = OWN_NAMES) -> str:
 
 def face_up(up: tc.Floats, names: Mapping[str, str] = OWN_NAMES) -> str | None:
     """Name of the face that points up where `described` tells it alone."""
-    return next((names[axis] for axis in AXES if _nearby_deg(_vector(axis), up) == 0), None)
+    return next((names[axis] for axis in AXES if _nearby_deg(axis_vector(axis), up) == 0), None)
 
 
 def _nearby_deg(a: tc.Floats, b: tc.Floats) -> float:

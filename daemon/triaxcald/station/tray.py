@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import triaxcal as tc
-from triaxcald.station.faces import described, face_up, rotation, turned
+from triaxcald.mounting import rotation
+from triaxcald.station.faces import described, face_up, turned
 from triaxcald.station.guidance import Guide
 
 WAIT_HOLDS, WAIT_S = 3.0, 5.0

@@ -16,9 +16,9 @@ from tests.conftest import Workshop
 from tests.virtual_line import described, virtual_line
 from triaxcal.model.directions import directions
 from triaxcald.cli.commands import main
+from triaxcald.mounting import rotation
 from triaxcald.simulation import bench
 from triaxcald.station.faces import described as named
-from triaxcald.station.faces import rotation
 
 MOUNTINGS = {"left": "+x+y+z", "right": "-y+x+z"}
 FACES = {"+x": "A", "-x": "B", "+y": "C", "-y": "D", "+z": "E", "-z": "F"}

@@ -101,6 +101,22 @@ async def test_the_unit_boots_into_pre_operational_and_beats_once_a_second(
     assert master.received() == ["705: 7f"] * 3
 
 
+async def test_without_supply_nothing_is_sent_and_the_unit_boots_when_it_comes(
+    master: Master, clock: SteppedTimeBase, unit: ReferenceUnit
+) -> None:
+    await master.command(0x01)
+    await clock.advance(0.5)
+    unit.switch_off(0.5)
+    master.received()
+    await clock.advance(10.0)
+    master.send(0x605, "40 18 10 01 00 00 00 00")
+    await clock.advance(10.0)
+    assert master.received() == []
+    unit.switch_on(20.5)
+    await clock.advance(1.5)
+    assert master.received() == ["705: 00", "705: 7f"]
+
+
 async def test_four_tpdos_a_sample_once_it_is_operational(master: Master, clock: SteppedTimeBase) -> None:
     await clock.advance(0.995)  # samples 0 to 99 are taken before the start
     await master.command(0x01)

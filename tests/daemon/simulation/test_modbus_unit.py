@@ -16,7 +16,15 @@ from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.modbus.protocol import READ_INPUT, SerialLine, TcpAddress
 from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.registers import crc
-from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, WINDOW_WORDS, ModbusMap, ModbusUnit, pty_pair
+from triaxcald.simulation.modbus_unit import (
+    FIFO_RECORDS,
+    GONE_S,
+    HOLDING,
+    WINDOW_WORDS,
+    ModbusMap,
+    ModbusUnit,
+    pty_pair,
+)
 from triaxcald.simulation.time_base import RealTimeBase, SteppedTimeBase
 from triaxcald.simulation.unit import CALIBRATION, COVERED, TABLE, Faults, ReferenceUnit
 
@@ -236,6 +244,31 @@ async def test_a_reader_is_behind_once_it_has_begun_and_leaves_much_in_a_fifo(un
     assert not time_base.behind(), "the corrected ones are not wanted"
     fetch(0x0400)
     assert time_base.behind()
+
+
+async def test_a_reader_that_has_gone_holds_up_nobody_after_a_while(unit):
+    time_base = ToldBehind()
+    windows = ModbusMap(unit, time_base)
+    await time_base.advance(2.0)
+    windows.read(READ_INPUT, 0x0000, WINDOW_WORDS)
+    for seconds, is_behind in ((GONE_S - 1.0, True), (2.0, False)):
+        await time_base.advance(seconds)
+        windows.fill()
+        assert time_base.behind() is is_behind
+    windows.read(READ_INPUT, 0x0000, WINDOW_WORDS)
+    assert time_base.behind(), "it is back"
+
+
+async def test_without_supply_it_keeps_silent_and_its_fifos_are_empty_afterwards(unit, time_base):
+    async with ModbusUnit(unit, time_base) as served, socket_to(served) as ask:
+        await time_base.advance(1.0)
+        unit.switch_off(1.0)
+        assert await ask("0001 0000 0006 01 03 0008 0001", within_s=SILENCE_S) == ""
+        await time_base.advance(10.0)
+        unit.switch_on(11.0)
+        await time_base.advance(0.125)
+        window = bytes.fromhex(await ask("0002 0000 0006 01 04 0000 000D"))[9:]
+        assert struct.unpack(">HHHHI", window[:12]) == (1, 2, 0, 0, 0)
 
 
 async def test_a_unit_that_restarts_is_silent_and_comes_back_empty_and_locked(unit, time_base):

@@ -147,6 +147,17 @@ async def test_elastic_time_is_no_faster_than_the_wall_clock_while_the_reader_is
     assert wall.now_s - 1000.0 == pytest.approx(1.0 / slowed + 1.0 / speed)
 
 
+@pytest.mark.parametrize("behind", [(True, False), (False, True), (False, False)])
+async def test_a_clock_that_units_share_waits_for_each_of_their_readers(
+    wall: WallClock, behind: tuple[bool, bool]
+) -> None:
+    base = ElasticTimeBase(speed=20.0)
+    for is_behind in behind:
+        base.wait_for_reader(lambda is_behind=is_behind: is_behind)
+    await base.wait_until(1.0)
+    assert wall.now_s - 1000.0 == pytest.approx(1.0 if any(behind) else 1.0 / 20.0)
+
+
 async def test_a_clock_of_the_wall_or_of_a_test_waits_for_no_reader(wall: WallClock) -> None:
     real, stepped = RealTimeBase(speed=20.0), SteppedTimeBase()
     for base in (real, stepped):

@@ -235,6 +235,27 @@ def test_a_power_cut_while_storing_leaves_the_old_copy_whole() -> None:
     assert status(made, 1.0) == 0
 
 
+def test_without_supply_it_is_silent_and_a_cut_store_is_lost() -> None:
+    made = unlocked()
+    put(made, "bias_x", 0.5)
+    seal(made)
+    made.write("store", b"evas", 0.0)
+    made.switch_on(0.01)  # it is on
+    assert made.alive(0.01)
+    made.switch_off(0.02)
+    for t_s in (0.02, 10.0, 20.0):
+        assert not made.alive(t_s)
+        assert len(made.advance(t_s)) == 0
+    with pytest.raises(UnitSilent):
+        made.read("status", 20.0)
+    made.switch_on(30.0)
+    assert not made.alive(30.05)
+    assert made.read("bias_x", 30.1) == bytes(4)
+    assert made.eeprom == unit().eeprom
+    run = made.advance(30.2)
+    assert (run.counter[0], run.unit_time_s[0]) == (0, pytest.approx(30.1))
+
+
 def test_reset_restores_the_stored_copy_locks_and_is_silent_for_100_ms() -> None:
     made = unlocked()
     put(made, "bias_x", 0.5)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from triaxcal.model.directions import cube_directions, directions, elsewhere
-from triaxcald.station.faces import OWN_NAMES, described, face_up, rotation, turned
+from triaxcald.mounting import rotation
+from triaxcald.station.faces import OWN_NAMES, described, face_up, turned
 
 SIGNED = [sign + axis for axis in "xyz" for sign in "+-"]
 VECTORS = {axis: np.array([(1 if axis[0] == "+" else -1) * (axis[1] == a) for a in "xyz"], float) for axis in SIGNED}

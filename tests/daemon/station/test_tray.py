@@ -12,7 +12,8 @@ import pytest
 
 from triaxcal.model.directions import bias_directions, directions, elsewhere
 from triaxcal.poses.pose import Pose
-from triaxcald.station.faces import OWN_NAMES, described, rotation
+from triaxcald.mounting import rotation
+from triaxcald.station.faces import OWN_NAMES, described
 from triaxcald.station.guidance import COVERED_DEG, Guide, NextPose, guide
 from triaxcald.station.tray import WAIT_HOLDS, WAIT_S, Instruction, Tray
 
