@@ -81,7 +81,7 @@ def outcome_document(
     """``ended`` is a time in words; ``supersedes`` the digest of the outcome
     that this one replaces, ``journal`` the path of a journal that is still
     needed, ``forced`` the reason for which sanity warnings were overruled;
-    ``attempt`` is None for an outcome as versions before 0.3 wrote it."""
+    ``attempt`` is None for an outcome as development versions before 0.2 wrote it."""
     from triaxcald.schema.outcome import Contents, LimitsOfOutcome, Outcome, Work
     from triaxcald.schema.verification import Verification
 

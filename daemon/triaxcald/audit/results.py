@@ -329,7 +329,7 @@ def outcome_again(
 
 def _attempt_in(stored: Mapping[str, Any], recording: Recording) -> Attempt | None:
     """The attempt: its id and its work as the recording's metadata have them. None in a
-    recording of a version before 0.3."""
+    recording of a development version before 0.2."""
     held = recording.metadata.get(RUN_RECORD)
     if held is None:
         return None

@@ -67,6 +67,7 @@ class Bars:
             console=self._console,
             disable=not self._live,
             expand=True,
+            transient=True,  # the lines of the verdicts stay
         )
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, str] = {}

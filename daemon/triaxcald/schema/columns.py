@@ -78,7 +78,7 @@ def _coefficients() -> list[Column]:
 
 
 COLUMNS: Final[tuple[Column, ...]] = (
-    _text("run", "id of the run; empty before version 0.3"),
+    _text("run", "id of the run; empty before version 0.2"),
     _text("station", "name of the station", required=True),
     _text("unit", "name of the unit in the station file", required=True),
     _text("slot", "slot: name of the `[[units]]` entry", "work", "slot"),

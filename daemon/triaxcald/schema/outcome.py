@@ -124,13 +124,13 @@ class Outcome(tc.schema.Model):
     serial: Annotated[str | None, Field(description="serial number; `null` without one")]
     station: Annotated[str, Field(description="name of the station")]
     run: Annotated[
-        str | None, Field(description="id of this attempt, a UUID of version 7; absent before version 0.3")
+        str | None, Field(description="id of this attempt, a UUID of version 7; absent before version 0.2")
     ] = None
-    started: Annotated[str | None, Field(description="start of the work, UTC, ISO 8601; absent before version 0.3")] = (
+    started: Annotated[str | None, Field(description="start of the work, UTC, ISO 8601; absent before version 0.2")] = (
         None
     )
     ended: Annotated[str, Field(description="end of the work, UTC, ISO 8601")]
-    work: Annotated[Work | None, Field(description="what it was measured for; absent before version 0.3")] = None
+    work: Annotated[Work | None, Field(description="what it was measured for; absent before version 0.2")] = None
     recording: Annotated[tc.schema.Text | None, Field(description="file name of the recording; `null` without one")] = (
         None
     )

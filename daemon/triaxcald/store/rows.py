@@ -31,7 +31,7 @@ class NoOutcome(Exception):
 def cells_of(data: bytes, name: str) -> dict[str, Cell]:
     """The row of the outcome with these bytes in the file ``name``: the cells of
     `NAMES`, and those that only the index has. A `provision` or `restore` was no
-    attempt at the unit; before version 0.3 an attempt is known by the contents of its
+    attempt at the unit; before version 0.2 an attempt is known by the contents of its
     recording. Raises NoOutcome."""
     try:
         document = parse_document(data, where=name)
