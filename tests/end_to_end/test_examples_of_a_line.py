@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from triaxcald.audit import audit
+
 EXAMPLES = Path(__file__).parents[2] / "examples" / "line"
 PLAN = {"poses": 14, "hold_s": 1.0, "check_poses": 3}
 LIMITS = {"rms_g": 5e-5, "verification_rms_g": 5e-5}
@@ -31,11 +33,14 @@ def ran(script: str, *arguments: Any, **environment: str) -> subprocess.Complete
 
 def test_verdicts_come_one_a_line(workshop: Any) -> None:
     with workshop.serve(workshop.device()) as served:
-        station = workshop.station({"name": "left", "bus": served.bus}, plan=PLAN, limits=LIMITS)
+        unit = {"name": "left", "serial": "9999", "bus": served.bus}
+        station = workshop.station(unit, plan=PLAN, limits=LIMITS)
         good = ran("verdicts.py", station, "--serial", "left=4711")
         other = ran("verdicts.py", station, "--serial", "left=4712")
     assert (good.returncode, good.stdout) == (0, "PASS     left 4711: within_limits\n")
     assert (other.returncode, other.stdout) == (4, "STOPPED  left 4712: wrong_unit\n")
+    (recording,) = workshop.folder.glob("*.mcap")
+    assert audit(recording).differences == ()  # though the station file names another serial number
 
 
 def test_openhtf_reports_measurements_with_units_and_limits(workshop: Any) -> None:

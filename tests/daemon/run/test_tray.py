@@ -135,6 +135,26 @@ def test_one_unit_is_stopped_with_a_reason_while_the_other_goes_on(bench: Path) 
     assert list(bench.parent.glob(f"{FOLDER}/*")) == []
 
 
+def test_a_failed_unit_keeps_its_coefficients_and_has_no_certificate(workshop: Any, triaxcal: Any) -> None:
+    bus = {"host": "127.0.0.1", "port": 502}
+    device = workshop.device("modbus.toml", bus=bus, serial=4712)
+    station = workshop.station({"name": "right", "serial": "4712", "bus": bus}, plan=PLAN, limits={"rms_g": 1e-9})
+    with virtual_line(described(device)):
+        done = triaxcal("run", station, "--events")
+    assert done.code == 1
+    (ended,) = [e for e in map(json.loads, done.out.splitlines()) if e["event"] == "ended"]
+    outcome = ended["outcome"]
+    assert (outcome["verdict"], outcome["code"], outcome["work"]["serial"]) == ("fail", "fit_outside", "4712")
+    held = outcome["measured"]["calibration"]
+    for name, truth in ("scale_factor", [-2.41, -2.40, -2.37]), ("bias", [5.6e-3, -2.9e-3, 4.6e-3]):
+        assert held[name] == pytest.approx(truth, rel=0.05)
+        assert all(0 < error < 1e-3 for error in held["standard_error"][name])
+    assert len(held["misalignment"]) == len(held["standard_error"]["misalignment"]) == 3
+    assert list(workshop.folder.glob("*.certificate.json")) == []
+    (recording,) = workshop.folder.glob("*.mcap")
+    assert audit(recording).differences == ()
+
+
 def test_json_and_events_exclude_each_other(bench: Path, triaxcal: Any) -> None:
     triaxcal("run", bench, "--events", "--json").failed(2, "--events", "--json")
     assert list(bench.parent.glob("*.outcome.json")) == []
