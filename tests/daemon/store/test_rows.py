@@ -87,7 +87,7 @@ def test_bytes_that_are_no_outcome_make_no_row(data: bytes) -> None:
 
 
 def test_a_stored_outcome_of_an_earlier_version_has_empty_cells_for_later_keys() -> None:
-    with Recording.open(RECORDINGS / "can-second-order.mcap") as recording:
+    with Recording.open(RECORDINGS / "made-by/0.2.0.dev0/can-second-order.mcap") as recording:
         data = recording.attachments["outcome.json"]
     held = Outcome.read(json.loads(data))
     assert held is not None
