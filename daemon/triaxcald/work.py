@@ -3,6 +3,7 @@ command line or in the station file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
@@ -51,6 +52,11 @@ class Work:
 
 
 KEYS: Final = ("serial", "operator", "order", "batch", "part_number", "fixture", "slot", "attempt", "reason")
+
+
+def plain_serial(text: str) -> str:
+    """Without leading zeros, also after a minus sign: a device holds a number."""
+    return re.sub("^(-?)0+", r"\1", text.strip())
 
 
 def wrong(text: str) -> str | None:

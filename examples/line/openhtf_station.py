@@ -36,6 +36,7 @@ def calibrate(test: htf.TestApi) -> htf.PhaseResult:
     slot = tomllib.loads(STATION.read_text())["units"][0]["name"]
     command = [sys.executable, "-m", "triaxcald.cli", "run", str(STATION), "--events"]
     command += ["--serial", f"{slot}={test.test_record.dut_id}"]
+    outcome = None
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
         for line in run.stdout:
             event = json.loads(line)
@@ -43,6 +44,8 @@ def calibrate(test: htf.TestApi) -> htf.PhaseResult:
                 test.logger.info("%s of %s poses; next %s", event["found"], event["wanted"], event["next"]["label"])
             if event["event"] == "ended":
                 outcome = event["outcome"]
+    if outcome is None:  # a wrong argument or a rule: nothing began, and standard error has the reason
+        raise RuntimeError(f"triaxcal run: exit code {run.returncode}")
     test.measurements.code = outcome["code"]
     if outcome["measured"]:
         test.measurements.fit_rms = outcome["measured"]["after"]["rms_g"]

@@ -17,7 +17,9 @@ SLOTS = [unit["name"] for unit in tomllib.loads(STATION.read_text())["units"]]
 def outcomes() -> dict:
     """The outcome of each slot."""
     command = [sys.executable, "-m", "triaxcald.cli", "run", str(STATION), "--events"]
-    events = map(json.loads, subprocess.run(command, stdout=subprocess.PIPE, text=True).stdout.splitlines())
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    events = map(json.loads, done.stdout.splitlines())
+    assert done.returncode != 2, "a wrong argument or a rule: nothing began, and standard error has the reason"
     return {event["unit"]: event["outcome"] for event in events if event["event"] == "ended"}
 
 

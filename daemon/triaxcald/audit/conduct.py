@@ -178,6 +178,10 @@ class _Audit:
     def _add(self, part: str, kind: Kind, place: str = "", **values: Any) -> None:
         self._differences.append(Difference(part, kind, place, **values))
 
+    @property
+    def _killed(self) -> bool:
+        return self._outcome.get("code") == Code.KILLED
+
     def _again(self) -> Again | None:
         try:
             again = self._compute(self._recording, self._raw)
@@ -333,6 +337,7 @@ class _Audit:
             held=held_in(self._outcome) if self._outcome else None,
             forced=self._outcome.get("forced") is not None or not self._outcome,
             aborted=self._aborted,
+            killed=self._killed,
             provisioned=self._check_events(again),
             rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
         )
@@ -363,9 +368,8 @@ class _Audit:
         if again.written and not self._aborted and provisioned is None:
             self._add(EVENTS, Kind.MISSING, "provisioned")
         if self._outcome:
-            killed = self._outcome.get("code") == Code.KILLED  # which wrote no event any more
-            reason = self._outcome.get("reason") if self._aborted and not killed else None
-            if failed != reason:
+            reason = self._outcome.get("reason") if self._aborted else None
+            if failed != reason and not self._killed:  # the process may have told another reason, or none
                 self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)
             state = self._outcome.get("device_state")
             undone = self._outcome.get("verdict") == Verdict.FAIL.value and again.written

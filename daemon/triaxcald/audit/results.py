@@ -183,7 +183,7 @@ def _certified(
 
 def _earlier(recording: Recording) -> EarlierFile | None:
     """The calibration of which the recording renews the biases alone."""
-    name = recording.metadata.get(WORK_RECORD, {}).get("calibration")
+    name = recording.metadata.get(RECORD, {}).get("calibration")
     if (name is None) != (EARLIER not in recording.attachments):
         raise RecordingError(f"attachment {EARLIER}: without its metadata {RECORD}, or the other way round")
     return None if name is None else EarlierFile.parsed(recording.attachments[EARLIER], name)

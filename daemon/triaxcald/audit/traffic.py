@@ -153,6 +153,8 @@ class Said:
     """The registers that were written, by the event; None where there is no
     such event."""
     rules: Rules = Rules.MARK_OR_SUPPLY
+    killed: bool = False
+    """Whether the process was killed, and the next start has written the outcome."""
 
     @property
     def old(self) -> Raw | None:
@@ -244,6 +246,8 @@ def _unequal(part: str, stored: Raw, read: Raw) -> list[Difference]:
 
 def _told(traffic: Traffic, said: Said) -> list[Difference]:
     """What the outcome, or the event alone, says was written."""
+    if said.killed:  # the outcome was written by the next start, which knows no register
+        return []
     written = _names(said.told.get("written")) if said.told else said.provisioned
     found: list[Difference] = []
 

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from triaxcald.station.guidance import Guide
     from triaxcald.station.tray import Instruction
 
-DRAIN_S = 5.0
+DRAIN_S = 30.0
 """Longest wait at the end for a reader that does not read."""
 
 
@@ -32,14 +33,17 @@ def _now() -> datetime:
 
 class EventLines:
     """Writes each event at once, on a thread of its own: a reader that is slow or gone
-    stops no measurement. ``runs`` maps the slots to the ids of their runs."""
+    stops no measurement. ``write`` takes the bytes of a line; it may block, and raises
+    OSError. ``runs`` maps the slots to the ids of their runs."""
 
-    def __init__(self, out: TextIO, tray: str, runs: Mapping[str, str], now: Callable[[], datetime] = _now) -> None:
-        self._out, self._tray, self._runs, self._now = out, tray, runs, now
+    def __init__(
+        self, write: Callable[[bytes], object], tray: str, runs: Mapping[str, str], now: Callable[[], datetime] = _now
+    ) -> None:
+        self._write, self._tray, self._runs, self._now = write, tray, runs, now
         self._seq = 0
         self._latest: dict[str, object] = {}
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write, name="events", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="events", daemon=True)
 
     def __enter__(self) -> EventLines:
         self._thread.start()
@@ -114,11 +118,10 @@ class EventLines:
         }
         self._lines.put(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)))
 
-    def _write(self) -> None:
+    def _work(self) -> None:
         while (line := self._lines.get()) is not None:
             try:
-                self._out.write(line + "\n")
-                self._out.flush()
+                self._write(f"{line}\n".encode())
             except (OSError, ValueError):  # nobody reads any more; the work goes on
                 with suppress(OSError):
                     self._drop()
@@ -128,6 +131,27 @@ class EventLines:
         """Later lines go nowhere."""
         while self._lines.get() is not None:
             pass
+
+
+@contextmanager
+def writes_to(stream: TextIO) -> Iterator[Callable[[bytes], object]]:
+    """Writes to the file descriptor of a stream, past Python's buffers, whose lock a
+    blocked write would keep from the end of the process. A stream that another program
+    has put there may have no descriptor."""
+    try:
+        own = os.dup(stream.fileno())
+    except (OSError, ValueError):
+        yield lambda data: print(data.decode(), end="", file=stream, flush=True)
+        return
+
+    def write(data: bytes) -> None:
+        while data:
+            data = data[os.write(own, data) :]
+
+    try:
+        yield write
+    finally:
+        os.close(own)
 
 
 class Several:

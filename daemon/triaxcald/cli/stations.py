@@ -17,7 +17,7 @@ import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.cli.bars import Bars, verdict_line
 from triaxcald.cli.console import emit, micro, say, show, showing, table
-from triaxcald.cli.events import EventLines, Several
+from triaxcald.cli.events import EventLines, Several, writes_to
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError, severest
@@ -36,8 +36,11 @@ def run_command(a: argparse.Namespace) -> int:
         raise InputError("--events: standard output has one JSON object a line, or with --json one document; give one")
     station = load_station(a.station)
     station.require_units()
+    from triaxcald.run.attempts import settle_killed
     from triaxcald.run.orders import with_serials, works
 
+    for killed in settle_killed(station):  # they count as attempts
+        say(killed.line)
     station = with_serials(station, a.serial)
     given = {key: getattr(a, key) for key in ("operator", "order", "batch", "part_number", "fixture", "reason")}
     work = works(station, given)
@@ -69,7 +72,8 @@ def run_command(a: argparse.Namespace) -> int:
         )  # fmt: skip
         if a.events:
             runs = {slot: unit.run for slot, unit in tray.units.items()}
-            receivers.append(stack.enter_context(EventLines(sys.stdout, tray.id, runs)))
+            write = stack.enter_context(writes_to(sys.stdout))
+            receivers.append(stack.enter_context(EventLines(write, tray.id, runs)))
         outcomes = run_interruptible(tray)
     with showing(worst(outcomes), _told(outcomes)):
         if a.json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 import triaxcal_drivers as td
 from triaxcald.errors import ProvisionError, TwoAnswer
 from triaxcald.provision.access import RegisterLink, contact_register
+from triaxcald.work import plain_serial
 
 
 class WrongUnit(ProvisionError):
@@ -176,8 +176,4 @@ def serial_text(number: int) -> str:
 def same_serial(serial: str | None, expected: str) -> bool:
     """Leading zeros do not count, also after a minus sign: the device holds a
     number."""
-    return serial is not None and _without_zeros(serial) == _without_zeros(expected)
-
-
-def _without_zeros(serial: str) -> str:
-    return re.sub("^(-?)0+", r"\1", serial.strip())
+    return serial is not None and plain_serial(serial) == plain_serial(expected)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -22,8 +23,19 @@ from triaxcald import text
 from triaxcald.documents import to_text
 from triaxcald.errors import DiskError, InputError, RecordingError
 from triaxcald.files import synchronise, write_durably, write_new, write_text
-from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, Code, Ending, Papers, outcome_document
-from triaxcald.provision.journal import open_journal
+from triaxcald.outcome import (
+    ATTACHMENT,
+    CERTIFICATE,
+    REPORT,
+    RUN_RECORD,
+    SUFFIX,
+    Code,
+    Ending,
+    Papers,
+    outcome_document,
+)
+from triaxcald.provision.journal import FOLDER as JOURNALS
+from triaxcald.provision.journal import parse
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import Sealed, recover
@@ -31,7 +43,7 @@ from triaxcald.recording.survey import survey
 from triaxcald.software import software
 from triaxcald.station.config import Station
 from triaxcald.store import History
-from triaxcald.work import Attempt, Work
+from triaxcald.work import Attempt, Work, wrong
 
 try:
     import fcntl
@@ -49,13 +61,15 @@ PAPERS: Final = (CERTIFICATE, REPORT)
 @dataclass
 class AttemptFile:
     """The file of an attempt under way. ``serial`` is the number that the unit itself
-    has told, ``held`` the state of its device once a provisioning is settled."""
+    has told, ``journal`` the path of a journal that an earlier run has left, ``held``
+    the state of the device once a provisioning is settled."""
 
     path: Path
     tray: str
     station: str
     attempt: Attempt
     serial: str | None = None
+    journal: str | None = None
     held: Held | None = None
 
     def write(self) -> None:
@@ -70,6 +84,7 @@ class AttemptFile:
             "recording": self.attempt.recording,
             "work": self.attempt.work.document(),
             "serial": self.serial,
+            "journal": self.journal,
             "held": None
             if held is None
             else {"state": held.state, "evidence": held.evidence, "observed": held.observations},
@@ -81,7 +96,7 @@ class AttemptFile:
 
     def remove(self) -> None:
         """Remove the file, since the outcome is on the disk. Raises nothing: the next
-        start finds the outcome and removes it."""
+        start finds that outcome, and removes this file."""
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
 
@@ -90,7 +105,9 @@ class AttemptFile:
         """None where the file is none of ours, or gone."""
         try:
             held = json.loads(path.read_bytes())
-            state = held["held"]
+            state, work = held["held"], Work(**held["work"])
+            if any(isinstance(text, str) and wrong(text) for text in work.document().values()):
+                return None
             return AttemptFile(
                 path,
                 str(held["tray"]),
@@ -98,10 +115,11 @@ class AttemptFile:
                 Attempt(
                     str(held["run"]),
                     str(held["started"]),
-                    Work(**held["work"]),
+                    work,
                     held["recording"] if held["recording"] is None else Path(held["recording"]).name,
                 ),
                 held["serial"],
+                held["journal"],
                 None
                 if state is None
                 else Held(
@@ -147,9 +165,9 @@ class Attempts:
             os.close(self._lock)
             self._lock = None
 
-    def begin(self, attempt: Attempt) -> AttemptFile:
+    def begin(self, attempt: Attempt, journal: str | None = None) -> AttemptFile:
         """The file of an attempt that begins, on the disk. Raises DiskError."""
-        file = AttemptFile(self._within / f"{attempt.run}.json", self.tray, self.station, attempt)
+        file = AttemptFile(self._within / f"{attempt.run}.json", self.tray, self.station, attempt, journal=journal)
         file.write()
         return file
 
@@ -189,6 +207,8 @@ def settle_killed(station: Station) -> list[Killed]:
             trays.setdefault(file.tray, []).append(file)
     found = []
     for tray, files in trays.items():
+        if fcntl is None:  # nobody knows whether its process is alive
+            break
         try:
             with _abandoned(within / f"{tray}.lock") as abandoned:
                 if abandoned:
@@ -204,12 +224,11 @@ def _abandoned(path: Path) -> Iterator[bool]:
     file removed at the end."""
     descriptor = _opened(path)
     try:
-        if fcntl is not None:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                yield False
-                return
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+            return
         yield True
         path.unlink(missing_ok=True)
         with suppress(OSError):
@@ -222,8 +241,8 @@ def _settle(station: Station, file: AttemptFile) -> Killed | None:
     """The outcome of a killed attempt; None if the attempt has one already."""
     name = file.attempt.recording
     recording = None if name is None else station.folder / name
-    if recording is not None and not recording.exists():
-        recording = None
+    if recording is not None and not (recording.exists() and _run_of(recording) in (file.attempt.run, None)):
+        recording = None  # it was not made, or is that of another run
     if _has_outcome(station.folder, file, recording):
         file.remove()
         return None
@@ -256,7 +275,7 @@ def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> boo
             held = {name: finished.attachments[name] for name in (*PAPERS, ATTACHMENT) if name in finished.attachments}
     except (RecordingError, InputError):
         return False
-    if ATTACHMENT not in held:
+    if ATTACHMENT not in held or _run(held[ATTACHMENT]) != file.attempt.run:
         return False
     for name, data in held.items():
         path = recording.with_suffix(f".{name}")
@@ -265,18 +284,34 @@ def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> boo
     return True
 
 
+def _run_of(recording: Path) -> str | None:
+    """The run of a recording by its metadata; None if it cannot be read."""
+    try:
+        with Recording.open(recording, unfinished=True) as found:
+            return found.metadata.get(RUN_RECORD, {}).get("run")
+    except (RecordingError, InputError):
+        return None
+
+
 def _run_in(path: Path) -> str | None:
     try:
-        found = json.loads(path.read_bytes())
-        return str(found["run"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return _run(path.read_bytes())
+    except OSError:
+        return None
+
+
+def _run(outcome: bytes) -> str | None:
+    """The run of an outcome; None of what is none."""
+    try:
+        return str(json.loads(outcome)["run"])
+    except (ValueError, LookupError, TypeError, RecursionError):
         return None
 
 
 def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Path) -> dict[str, Any]:
     """Mend the recording, with the outcome as its last attachment. Raises
     RecordingError, Refused, InputError."""
-    draft, mended = (recording.with_suffix(f".{kind}.mcap") for kind in ("draft", "mended"))
+    draft, mended = (recording.with_suffix(f".mcap.{kind}") for kind in ("draft", "mended"))
     for path in (draft, mended):
         path.unlink(missing_ok=True)  # of a start that was killed itself
     try:
@@ -288,7 +323,7 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
         sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), to_text(document).encode())
         recovery = recover(recording, mended, without=PAPERS, sealed=sealed)
         if not recovery.lossless:  # what could not be read may be read by somebody else
-            os.replace(recording, recording.with_suffix(DAMAGED))
+            _keep(recording)
         os.replace(mended, recording)
         synchronise(recording.parent)
     except OSError as e:
@@ -297,6 +332,17 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
         for path in (draft, mended):
             path.unlink(missing_ok=True)
     return document
+
+
+def _keep(recording: Path) -> None:
+    """A second name for the file, so that at no moment the recording is missing.
+    Raises OSError."""
+    kept = recording.with_suffix(DAMAGED)
+    kept.unlink(missing_ok=True)
+    try:
+        os.link(recording, kept)
+    except OSError:  # a file system without links
+        shutil.copyfile(recording, kept)
 
 
 def _document(
@@ -326,14 +372,22 @@ def _held(station: Station, file: AttemptFile) -> tuple[Held, Path | None]:
     The journal is on the disk before the first write. It is removed after the file of
     the attempt has the state of the settled device.
     """
-    place = next((p for p in station.places if p.unit.name == file.attempt.work.slot), None)
-    journal = None
-    if place is not None:
-        serial = file.serial or place.unit.serial
-        journal = open_journal(station.folder, place.bundle.profile, file.attempt.work.slot, serial)
+    journal = _journal(station.folder, file)
     if journal is not None:
         return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER), journal
     return file.held or Held(), None
+
+
+def _journal(folder: Path, file: AttemptFile) -> Path | None:
+    """The journal of this run, or that of an earlier one which the run has found,
+    whatever the station file names by now."""
+    if file.journal is not None and Path(file.journal).exists():
+        return Path(file.journal)
+    for path in sorted((folder / JOURNALS).glob("*.json")):
+        with suppress(OSError, InputError):
+            if parse(path.read_bytes(), where=str(path)).run == file.attempt.run:
+                return path
+    return None
 
 
 def _ended_ns(file: AttemptFile) -> int:

@@ -47,7 +47,7 @@ from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
 from triaxcald.store import History
-from triaxcald.work import Attempt, Work
+from triaxcald.work import Attempt, Work, wrong
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class ProvisionRun:
     _attempt: Attempt = field(init=False)
 
     def __post_init__(self) -> None:
-        work = Work(self.place.unit.name, self.serial or self.place.unit.serial)
+        serial = self.serial if self.serial and wrong(self.serial) is None else self.place.unit.serial
+        work = Work(self.place.unit.name, serial)
         self._attempt = Attempt(self.id, self._now(), work)
 
     async def run(self) -> Provisioned:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Awaitable, Callable, Generator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,8 @@ from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.earlier import ATTACHMENT as EARLIER
 from triaxcald.earlier import RECORD, EarlierFile
-from triaxcald.errors import DISK, REFUSED, DiskError, InputError, RecordingError
-from triaxcald.files import write_new, write_text
+from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
+from triaxcald.files import unused, write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
     ATTACHMENT,
@@ -104,8 +104,9 @@ class UnitRun(UnitSession):
     ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
     the active units of the station. ``rezero`` is a calibration whose biases alone
     are renewed. ``work`` is what the unit is measured for, ``attempts`` the tray that
-    the run belongs to; by default it is a tray of its own. ``id`` is the id of the run.
-    ``tray`` is that of units which are turned together.
+    the run belongs to; by default it is a tray of its own. ``start`` lets all units
+    of a tray begin together. ``tray`` is that of units which are turned together.
+    ``id`` is the id of the run.
     """
 
     def __init__(
@@ -121,6 +122,7 @@ class UnitRun(UnitSession):
         rezero: EarlierFile | None = None,
         work: Work | None = None,
         attempts: Attempts | None = None,
+        start: Start | None = None,
         tray: Tray | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
@@ -129,10 +131,11 @@ class UnitRun(UnitSession):
         self.id = new_run_id(clock_ns())
         self.stopped_for: str | None = None
         """Reason of a stop of this unit alone."""
-        self._attempts = attempts
+        self._attempts, self._start = attempts, start
         self._attempt = Attempt(self.id, self._now(), work or Work(self.name, place.unit.serial))
         self._attempt_file: AttemptFile | None = None
         self._history = History()
+        self._answered = False
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
         self._recording: Path | None = None
@@ -160,20 +163,19 @@ class UnitRun(UnitSession):
     async def _run(self, tray: Attempts) -> Outcome:
         ending: Ending | None = None
         try:
-            if self._attempt_file is None:
-                await asyncio.to_thread(self.begin, tray)
+            await self._begin(tray)
             policy = RetryPolicy(others=self.others)
             async with self.place.opened(policy, partial(self.waits, policy)) as device:
                 identity = await self.identify(device)
                 await self._identified(identity)
-                self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
-                path = self.recording_path(identity)
+                path = unused(self.recording_path(identity))
                 if self.rezero is not None:
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
                 await self._require_readings_before(device)
-                await self._recorded_to(path)
+                await self._note(recording=path.name)
                 with self.writer(path, identity, ends_with=FORMAT, more=self._records) as writer:
+                    self._recording = path
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
                     ending = await self._ending(device, identity, writer)
@@ -196,22 +198,28 @@ class UnitRun(UnitSession):
                 self._attempt_file.remove()
         return self._outcome(ending)
 
-    def begin(self, tray: Attempts) -> None:
-        """Note the attempt on the disk. Raises DiskError."""
-        self._attempt_file = tray.begin(self._attempt)
-
-    def withdraw(self) -> None:
-        """Forget an attempt that did not begin."""
-        if self._attempt_file is not None:
-            self._attempt_file.remove()
+    async def _begin(self, tray: Attempts) -> None:
+        """Note the attempt on the disk, and wait until all units of the tray have.
+        Raises InputError, DiskError."""
+        work = self._attempt.work
+        if work.serial is not None:
+            await self._count(work.serial)
+        self._attempt_file = await asyncio.to_thread(
+            tray.begin, self._attempt, None if self._open_journal is None else str(self._open_journal)
+        )
+        if self._start is not None:
+            await self._start.wait(self.name)
+        if self.stopped_for is not None:  # before it began
+            raise asyncio.CancelledError
 
     def stop(self, reason: str) -> None:
-        """Note the reason of a stop, which a cancellation of `run` has to follow."""
+        """Note the reason of a stop, which a cancellation of `run` has to follow if the
+        run has begun."""
         self.stopped_for = reason
 
     def _aborted(self, e: BaseException) -> Ending:
         ending = aborted(e, self._provisioning)
-        if ending.code is Code.LOST and self._recording is None:  # it was never there
+        if ending.code is Code.LOST and not self._answered:  # it was never there
             ending = replace(ending, code=Code.ABSENT)
         if self.stopped_for is not None and isinstance(e, asyncio.CancelledError):
             return replace(ending, reason=f"stopped: {self.stopped_for}")
@@ -219,24 +227,29 @@ class UnitRun(UnitSession):
 
     async def _identified(self, identity: IdentityRead) -> None:
         """Note the serial number, and count the attempts at it. Raises InputError if
-        the rules of the station forbid another."""
-        self._serial = identity.serial
+        the rules of the station forbid another; DiskError."""
+        self._answered, self._serial = True, identity.serial
         work = self._attempt.work
-        self._history = await asyncio.to_thread(History.of, self.station.folder, identity.serial or work.serial)
-        attempt = None if (identity.serial or work.serial) is None else self._history.attempts + 1
         if work.serial is None and identity.serial is not None:  # else it was checked before the start
+            await self._count(identity.serial)
             rules = self.station.file.rules
             require_serial(rules, identity.serial, self.name)
             require_allowed(rules, work, identity.serial, self._history)
-        self._attempt = replace(self._attempt, work=replace(work, attempt=attempt))
+        self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
+        await self._note()
 
-    async def _recorded_to(self, path: Path) -> None:
-        """Note the recording before it begins. Raises DiskError."""
-        self._recording = path
-        self._attempt = replace(self._attempt, recording=path.name)
-        if self._attempt_file is not None:
-            self._attempt_file.attempt, self._attempt_file.serial = self._attempt, self._serial
-            await asyncio.to_thread(self._attempt_file.write)
+    async def _count(self, serial: str) -> None:
+        self._history = await asyncio.to_thread(History.of, self.station.folder, serial)
+        work = replace(self._attempt.work, attempt=self._history.attempts + 1)
+        self._attempt = replace(self._attempt, work=work)
+
+    async def _note(self, recording: str | None = None) -> None:
+        """Note on the disk what is known by now. Raises DiskError."""
+        assert self._attempt_file is not None
+        file, journal = self._attempt_file, self._open_journal
+        file.attempt, file.serial = replace(self._attempt, recording=recording), self._serial
+        file.journal = None if journal is None else str(journal)
+        await asyncio.to_thread(file.write)
 
     def _settled(self, held: Held) -> None:
         """Note the state of a settled device before its journal goes. Raises
@@ -326,7 +339,7 @@ class UnitRun(UnitSession):
             supersedes=self._history.latest if self._serial is not None else None,
             journal=self._journal,
             forced=self.force if back and back.warnings else None,
-            attempt=self._attempt,
+            attempt=replace(self._attempt, recording=self._recording.name if self._recording else None),
         )
 
     @property
@@ -565,6 +578,31 @@ class UnitHandle:
         return self._task is not None and self._task.done()
 
 
+@dataclass
+class Start:
+    """Lets the units of a tray begin together: ``opens`` is awaited once, after the
+    attempts of all ``units`` are on the disk. Raises what it raises, in every unit."""
+
+    units: set[str]
+    opens: Callable[[], Awaitable[None]]
+    _opening: asyncio.Task[None] | None = None
+    _opened: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def wait(self, unit: str) -> None:
+        """Raises InputError, DiskError."""
+        self.arrive(unit)
+        await self._opened.wait()
+        if self._opening is not None and (e := self._opening.exception()) is not None:
+            raise e
+
+    def arrive(self, unit: str) -> None:
+        """The unit is ready, or has ended before."""
+        self.units.discard(unit)
+        if not self.units and self._opening is None:
+            self._opening = asyncio.ensure_future(self.opens())
+            self._opening.add_done_callback(lambda _: self._opened.set())
+
+
 class TrayRun:
     """The units of a station that are started together; awaiting it runs them all, and
     gives their outcomes in the order of the station file.
@@ -573,6 +611,11 @@ class TrayRun:
     active. Each cancellation is passed on to every unit. The units first put their
     devices in order; the outcomes then have exit code 130. ``id`` is the id of the
     tray, ``units`` the handles by slot.
+
+    ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
+    maps it to what it is measured for. ``begun`` is called once all attempts are noted
+    on the disk, ``ended`` receives each outcome, ``killed`` each attempt that a killed
+    process has left in the folder.
     """
 
     def __init__(
@@ -591,6 +634,7 @@ class TrayRun:
         self._station, self._ended, self._killed, self._begun = station, ended, killed, begun
         self._serials, self._others = SerialsSeen(), ActiveUnits(len(station.places))
         self._attempts = Attempts(station.folder, self.id, station.file.name)
+        self._start = Start({place.unit.name for place in station.places}, self._open)
         tray = _tray_of(station)
         self._shown = None if tray is None else TrayProgress(progress, tray)
         self._runs = [
@@ -598,7 +642,7 @@ class TrayRun:
                 station, place, self._shown or progress,
                 serials=self._serials, force=force, others=self._others,
                 rezero=(rezero or {}).get(place.unit.name), work=(work or {}).get(place.unit.name),
-                attempts=self._attempts, tray=tray,
+                attempts=self._attempts, start=self._start, tray=tray,
             )
             for place in station.places
         ]  # fmt: skip
@@ -607,33 +651,25 @@ class TrayRun:
     def __await__(self) -> Generator[Any, None, list[Outcome]]:
         return self._all().__await__()
 
+    async def _open(self) -> None:
+        self._begun()
+        for killed in await asyncio.to_thread(settle_killed, self._station):
+            self._killed(killed)
+
     async def _all(self) -> list[Outcome]:
         """Raises InputError if the folder cannot be used."""
         with self._attempts.under_way(), ExitStack() as stack:
             for run in self._runs:
-                with suppress(DiskError):  # its own run reports it
-                    await asyncio.to_thread(run.begin, self._attempts)
-            self._begun()
-            try:
-                for killed in await asyncio.to_thread(settle_killed, self._station):
-                    self._killed(killed)
-            except BaseException:
-                for run in self._runs:
-                    run.withdraw()
-                raise
-            for run in self._runs:
                 stack.enter_context(at_abort(run.abort_notice))
             for run in self._runs:
-                handle = self.units[run.name]
-                handle._task = asyncio.ensure_future(self._one(run))
-                if run.stopped_for is not None:  # before it began
-                    handle._task.cancel()
+                self.units[run.name]._task = asyncio.ensure_future(self._one(run))
             return await side_by_side(handle._task for handle in self.units.values() if handle._task is not None)
 
     async def _one(self, run: UnitRun) -> Outcome:
         try:
             outcome = await run.run()
         finally:
+            self._start.arrive(run.name)
             self._others.leave()
             if self._shown is not None:
                 self._shown.ended(run.name)
@@ -641,13 +677,19 @@ class TrayRun:
         return outcome
 
 
-def run_station(station: Station, progress: Progress, **settings: Any) -> TrayRun:
-    """The units of a station, to be awaited; ``settings`` as in `TrayRun`: ``ended``
-    receives each outcome, ``killed`` each attempt that an earlier process left,
-    ``begun`` is called once the attempts are noted on the disk,
-    ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
-    maps it to what it is measured for."""
-    return TrayRun(station, progress, **settings)
+def run_station(
+    station: Station,
+    progress: Progress,
+    *,
+    force: str | None = None,
+    rezero: Mapping[str, EarlierFile] | None = None,
+    work: Mapping[str, Work] | None = None,
+    ended: Callable[[Outcome], None] = lambda _: None,
+    killed: Callable[[Killed], None] = lambda _: None,
+    begun: Callable[[], None] = lambda: None,
+) -> TrayRun:
+    """The units of a station, to be awaited; arguments as in `TrayRun`."""
+    return TrayRun(station, progress, force=force, rezero=rezero, work=work, ended=ended, killed=killed, begun=begun)
 
 
 def _tray_of(station: Station) -> Tray | None:

@@ -87,7 +87,7 @@ class Code(StrEnum):
     STOPPED = "stopped"
     """The work was interrupted."""
     KILLED = "killed"
-    """The process was killed; the next start in the folder found its recording."""
+    """The process was killed; the next start in the folder has written the outcome."""
     INTERNAL = "internal"
     """An error of this program."""
 

@@ -162,7 +162,8 @@ class Outcome(tc.schema.Model):
         ),
     ]
     registers: Annotated[
-        RegistersDone | None, Field(description="what was done to the registers; `null` if nothing was to be written")
+        RegistersDone | None,
+        Field(description="what was done to the registers; `null` if nothing was to be written, and after a kill"),
     ]
     forced: Annotated[
         tc.schema.Text | None, Field(description="reason of `--force`, if it overruled sanity warnings; else `null`")

@@ -169,7 +169,7 @@ class Unit(td.Strict):
         str,
         Field(pattern=r"^[^\x00]+$", description="a file beside the station file, or the name of a built-in profile"),
     ]
-    serial: Annotated[str | None, Field(description="refuse any other unit")] = None
+    serial: Annotated[WorkText | None, Field(description="refuse any other unit")] = None
     signs: Annotated[
         tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None,
         Field(description="of the scale factors; by default the profile's"),

@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 
 from triaxcald.files import unused
 from triaxcald.schema.columns import COLUMNS, Kind
+from triaxcald.work import plain_serial
 
 FILE_NAME: Final = "triaxcal.sqlite"
 DAMAGED: Final = ".damaged"
@@ -179,7 +180,9 @@ def transaction(db: sqlite3.Connection) -> Iterator[None]:
 
 
 def _connected(path: Path | str) -> sqlite3.Connection:
-    return sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+    db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+    db.create_function("plain", 1, lambda serial: None if serial is None else plain_serial(str(serial)))
+    return db
 
 
 def _prepare(db: sqlite3.Connection) -> None:

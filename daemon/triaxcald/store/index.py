@@ -93,7 +93,7 @@ class Store:
 
     def latest(self, serial: str | None) -> str | None:
         """The SHA-256 of a unit's outcome that ended last; None where there is none."""
-        found = self._ask(f"SELECT outcome_sha256 FROM run WHERE serial = :serial {_LAST}", serial)
+        found = self._ask(f"SELECT outcome_sha256 FROM run WHERE plain(serial) = plain(:serial) {_LAST}", serial)
         return str(found[0]) if found else None
 
     def attempts(self, serial: str | None) -> int:
@@ -105,10 +105,10 @@ class Store:
         )
         return max(int(cell or 0) for cell in found) if found else 0
 
-    def last_verdict(self, serial: str | None) -> Verdict | None:
-        """The verdict of the last attempt at a unit; None where there is none."""
-        found = self._ask(f"SELECT verdict FROM run WHERE {_TRIED} {_LAST}", serial)
-        return next((verdict for verdict in Verdict if found and verdict == found[0]), None)
+    def has_passed(self, serial: str | None) -> bool:
+        """Whether an attempt at a unit has passed."""
+        found = self._ask(f"SELECT count(*) FROM run WHERE {_TRIED} AND verdict = '{Verdict.PASS}'", serial)
+        return bool(found and found[0])
 
     def runs(
         self,
@@ -124,7 +124,7 @@ class Store:
         read."""
         given = {
             "at_us >= ?": since_us, "at_us < ?": until_us,
-            "? IN (serial, work_serial)": serial, "code = ?": code,
+            "plain(?) IN (plain(serial), plain(work_serial))": serial, "code = ?": code,
         }  # fmt: skip
         wanted = {condition: value for condition, value in given.items() if value is not None}
         where = f" WHERE {' AND '.join(wanted)}" if wanted else ""
@@ -248,14 +248,14 @@ def _check(cells: Sequence[Cell]) -> int:
 _BESIDE = tuple(NAMES.index(column) for column in BESIDE)
 _FORGET = "DELETE FROM file WHERE name = ?"
 _INSERT = f"INSERT INTO run VALUES ({', '.join('?' * (len(NAMES) + len(OWN)))})"
-_TRIED = "tried AND :serial IN (serial, work_serial) AND :serial = coalesce(work_serial, serial)"
+_TRIED = "tried AND plain(coalesce(work_serial, serial)) = plain(:serial)"
 _LAST = "ORDER BY ended_us DESC, outcome DESC LIMIT 1"
 
 
 @dataclass(frozen=True)
 class History:
     """Earlier attempts at a unit in a folder: the digest of the ``latest`` outcome,
-    None without one, the number of attempts, and whether the last one passed."""
+    None without one, the number of attempts, and whether one has passed."""
 
     latest: str | None = None
     attempts: int = 0
@@ -268,5 +268,4 @@ class History:
         if serial is None:
             return History()
         with Store(folder) as store:
-            passed = store.last_verdict(serial) is Verdict.PASS
-            return History(store.latest(serial), store.attempts(serial), passed)
+            return History(store.latest(serial), store.attempts(serial), store.has_passed(serial))

@@ -130,6 +130,7 @@ def retests(workshop: Any) -> Iterator[Path]:
         yield station
 
 
+@pytest.mark.slow
 def test_a_retest_after_a_pass_needs_a_reason(retests: Path, triaxcal: Any) -> None:
     assert triaxcal("run", retests).code == 0
     outcomes = list(retests.parent.glob("*.outcome.json"))

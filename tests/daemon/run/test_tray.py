@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import json
+import os
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -18,8 +20,10 @@ from pydantic import TypeAdapter
 from tests.daemon.audit.forging import Forgery
 from tests.virtual_line import described, virtual_line
 from triaxcald.audit import audit
-from triaxcald.cli.events import EventLines
+from triaxcald.cli.events import EventLines, writes_to
+from triaxcald.provision.journal import Entry, Journal
 from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.recording.reader import Recording
 from triaxcald.run.attempts import FOLDER, Attempts, settle_killed
 from triaxcald.run.unit_run import Outcome, run_station
 from triaxcald.schema.codes import Stage
@@ -62,6 +66,7 @@ def bench(workshop: Any) -> Iterator[Path]:
         yield station
 
 
+@pytest.mark.slow
 def test_every_event_is_of_the_model_and_the_outcome_comes_when_its_unit_ends(bench: Path, triaxcal: Any) -> None:
     done = triaxcal("run", bench, "--events", "--operator", "A. Smith", "--order", "WO 7")
     assert done.code == 0
@@ -99,6 +104,7 @@ def test_every_event_is_of_the_model_and_the_outcome_comes_when_its_unit_ends(be
         assert any(p["next"] and p["next"]["once_more"] for p in first)
 
 
+@pytest.mark.slow
 def test_a_second_run_is_the_second_attempt_and_supersedes_the_first(bench: Path, triaxcal: Any) -> None:
     held = []
     for _ in range(2):
@@ -113,6 +119,7 @@ def test_a_second_run_is_the_second_attempt_and_supersedes_the_first(bench: Path
         assert first["run"] < second["run"]  # they sort by time
 
 
+@pytest.mark.slow
 def test_one_unit_is_stopped_with_a_reason_while_the_other_goes_on(bench: Path) -> None:
     ended: list[str] = []
 
@@ -135,6 +142,7 @@ def test_one_unit_is_stopped_with_a_reason_while_the_other_goes_on(bench: Path) 
     assert list(bench.parent.glob(f"{FOLDER}/*")) == []
 
 
+@pytest.mark.slow
 def test_a_failed_unit_keeps_its_coefficients_and_has_no_certificate(workshop: Any, triaxcal: Any) -> None:
     bus = {"host": "127.0.0.1", "port": 502}
     device = workshop.device("modbus.toml", bus=bus, serial=4712)
@@ -160,16 +168,44 @@ def test_json_and_events_exclude_each_other(bench: Path, triaxcal: Any) -> None:
     assert list(bench.parent.glob("*.outcome.json")) == []
 
 
-@pytest.mark.parametrize("broken", [BrokenPipeError, ValueError])
-def test_a_vanished_reader_of_the_events_stops_nothing(broken: type[Exception]) -> None:
-    class Gone(io.StringIO):
-        def write(self, text: str) -> int:
-            raise broken
-
-    with EventLines(Gone(), "tray", {"u": "run"}) as events:
+def test_a_vanished_reader_of_the_events_stops_nothing() -> None:
+    near, far = os.pipe()
+    with os.fdopen(far, "w") as out, writes_to(out) as write, EventLines(write, "tray", {"u": "run"}) as events:
+        out.close()
         events.begun()
+        assert json.loads(os.read(near, 4096))["event"] == "tray"
+        os.close(near)
         for _ in range(1000):
             events.stage("u", Stage.POSES)
+
+
+def test_a_reader_that_does_not_read_holds_up_no_event() -> None:
+    near, far = os.pipe()
+    told: list[bytes] = []
+    with os.fdopen(far, "w") as out, writes_to(out) as write, EventLines(write, "tray", {"u": "run"}) as events:
+        out.close()
+        begun_s = time.monotonic()
+        for _ in range(5000):  # a pipe takes 64 KiB
+            events.stage("u", Stage.POSES)
+        assert time.monotonic() - begun_s < 5
+        reader = threading.Thread(target=lambda: told.extend(iter(lambda: os.read(near, 65536), b"")))
+        reader.start()
+    reader.join(60)  # the writer has closed its end
+    assert [json.loads(line)["seq"] for line in b"".join(told).splitlines()] == list(range(1, 5002))
+
+
+@pytest.mark.slow
+def test_a_unit_that_is_stopped_before_the_start_gets_its_outcome(bench: Path) -> None:
+    async def work() -> list[Outcome]:
+        tray = run_station(load_station(bench), Quiet())
+        tray.units["left"].stop("wrong label")
+        return await tray
+
+    left, right = asyncio.run(work())
+    assert (left.document["code"], left.document["reason"], left.recording) == ("stopped", "stopped: wrong label", None)
+    assert left.outcome is not None
+    assert (right.exit_code, right.document["code"]) == (0, "no_limit")
+    assert list(bench.parent.glob(f"{FOLDER}/*")) == []
 
 
 # Killed runs. The recording is cut off at any byte, as a killed process leaves it.
@@ -181,8 +217,9 @@ class Killed:
     def __init__(self, folder: Path, station: Path, recording: Path) -> None:
         self.folder, self.station = folder, station
         self._whole = recording.read_bytes()
-        self.work = Work("modbus", serial="4712", order="WO 7", attempt=1)
-        self.attempt = Attempt("0193f0e4-0000-7000-8000-000000000001", "2026-03-02T09:00:00.000+00:00", self.work)
+        with Recording.open(recording) as found:
+            told, work = found.metadata["run"], Work.recorded(found.metadata["work"])
+        self.attempt = Attempt(told["run"], told["started"], work)
 
     def leave(self, cut: int | None, **more: Any) -> None:
         tray = Attempts(self.folder, "0193f0e4-0000-7000-8000-00000000000f", "bench")
@@ -220,7 +257,7 @@ def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Kill
     killed.leave(round(len(killed._whole) * share), serial="4712")
     held = killed.settled()
     assert (held["verdict"], held["code"], held["exit_code"]) == ("aborted", "killed", None)
-    assert (held["run"], held["serial"], held["work"]["order"]) == (killed.attempt.run, "4712", "WO 7")
+    assert (held["run"], held["serial"], held["work"]["attempt"]) == (killed.attempt.run, "4712", 1)
     assert (held["device_state"], held["journal"]) == ("untouched", None)
     recordings = list(killed.folder.glob("*.mcap"))
     if held["recording"] is None:  # not even its head was there: what is left of it is kept
@@ -232,6 +269,7 @@ def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Kill
         names = [r.name for r in Forgery.of(recording).records if hasattr(r, "media_type")]
         assert names[-1] == "outcome.json"
         assert not {"certificate.json", "report.html"} & set(names)
+        assert audit(recording).differences == ()
 
 
 def test_an_attempt_that_was_killed_before_its_recording_gets_an_outcome(killed: Killed) -> None:
@@ -254,11 +292,15 @@ def _is_outcome(record: Any) -> bool:
     return getattr(record, "name", None) == "outcome.json" and hasattr(record, "data")
 
 
-def test_a_journal_leaves_the_device_unknown_and_is_named(killed: Killed) -> None:
-    journal = killed.folder / "journal" / "TRIAX-REF-4712.json"
-    killed.leave(None, serial="4712", held=Held(DeviceState.NEW_VERIFIED, Evidence.RESTART))
+@pytest.mark.parametrize("run", [True, False])
+def test_a_journal_leaves_the_device_unknown_and_is_named(killed: Killed, run: bool) -> None:
+    """Of this run by its id, whatever units the station file has by now; of an earlier run by its path."""
+    journal = killed.folder / "journal" / "OTHER-77.json"
+    earlier = None if run else str(journal)
+    killed.leave(None, serial="4712", journal=earlier, held=Held(DeviceState.NEW_VERIFIED, Evidence.RESTART))
     journal.parent.mkdir()
-    journal.write_text("{}")
+    entry = Entry("other", "77", "0" * 64, "2026", {}, {}, run=killed.attempt.run if run else "another")
+    Journal(journal).write(entry)
     held = killed.settled()
     assert (held["device_state"], held["evidence"]) == ("unknown", "no_answer")
     assert held["journal"] == str(journal)

@@ -91,9 +91,9 @@ def test_the_latest_outcome_and_the_attempts_are_those_of_the_serial_number(
             last = max(reported, key=lambda d: d["ended"])["run"] if reported else None
             assert store.latest(serial) == digests.get(last)
             assert store.attempts(serial) == len(tried)
-            assert store.last_verdict(serial) == max(tried, key=lambda d: d["ended"])["verdict"]
-        assert (store.latest("unknown"), store.attempts("unknown"), store.last_verdict("unknown")) == (None, 0, None)
-        assert (store.latest(None), store.attempts(None), store.last_verdict(None)) == (None, 0, None)
+            assert store.has_passed(serial) == any(d["verdict"] == "pass" for d in tried)
+        assert (store.latest("unknown"), store.attempts("unknown"), store.has_passed("unknown")) == (None, 0, False)
+        assert (store.latest(None), store.attempts(None), store.has_passed(None)) == (None, 0, False)
 
 
 def test_the_latest_is_by_the_end_and_not_by_the_name(write: Write, tmp_path: Path) -> None:
@@ -103,25 +103,32 @@ def test_the_latest_is_by_the_end_and_not_by_the_name(write: Write, tmp_path: Pa
     assert History.of(tmp_path, "1042").latest == digest_of(late.read_bytes())
 
 
+@pytest.mark.parametrize("asked", ["42", "042", "0042", " 42"])
+def test_leading_zeros_of_a_serial_number_do_not_count(write: Write, tmp_path: Path, asked: str) -> None:
+    path = write("a", serial="0042", work={"serial": "42", "attempt": 1})
+    assert History.of(tmp_path, asked) == History(digest_of(path.read_bytes()), 1, passed=True)
+
+
 @pytest.mark.parametrize(
-    ("outcomes", "attempts", "last"),
+    ("outcomes", "attempts", "passed"),
     [
-        ([{"work": {"serial": "1042", "attempt": 3}}], 3, "pass"),
-        ([{"contents": None}], 0, None),  # a provisioning
-        ([{"work": {"serial": "1042", "attempt": 1}, "verdict": "aborted", "serial": None}], 1, "aborted"),
-        ([{"work": {"serial": "7777", "attempt": 1}}], 0, None),  # a wrong unit
-        ([{"ended": "2026-01-30T12:00:00Z"}, {"verdict": "fail"}], 2, "fail"),
+        ([{"work": {"serial": "1042", "attempt": 3}}], 3, True),
+        ([{"contents": None}], 0, False),  # a provisioning
+        ([{"work": {"serial": "1042", "attempt": 1}, "verdict": "aborted", "serial": None}], 1, False),
+        ([{"work": {"serial": "7777", "attempt": 1}}], 0, False),  # a wrong unit
+        ([{"ended": "2026-01-30T12:00:00Z"}, {"verdict": "fail"}], 2, True),
         ([{"work": {"serial": "1042", "attempt": 1}}, {"contents": None, "ended": "2026-02-01", "verdict": "fail"}],
-         1, "pass"),
+         1, True),
+        ([{"serial": "0042", "work": {"serial": "42", "attempt": 1}}, {"serial": "1042"}], 1, True),
     ],
 )  # fmt: skip
 def test_attempts_count_runs_by_the_expected_serial_number_first(
-    write: Write, tmp_path: Path, outcomes: list[dict[str, Any]], attempts: int, last: str | None
+    write: Write, tmp_path: Path, outcomes: list[dict[str, Any]], attempts: int, passed: bool
 ) -> None:
     for i, of in enumerate(outcomes):
         write(f"run-{i}", **of)
     with Store(tmp_path) as store:
-        assert (store.attempts("1042"), store.last_verdict("1042")) == (attempts, last)
+        assert (store.attempts("1042"), store.has_passed("1042")) == (attempts, passed)
 
 
 def test_runs_are_chosen_by_time_serial_number_and_code(write: Write, tmp_path: Path) -> None:
@@ -206,7 +213,7 @@ def test_a_store_that_stays_open_sees_what_comes(write: Write, tmp_path: Path) -
         write("a")
         assert store.attempts("1042") == 1
         write("b", ended="2026-02-01T00:00:00Z", verdict="fail")
-        assert store.last_verdict("1042") == "fail"
+        assert store.attempts("1042") == 2
 
 
 def test_what_is_no_outcome_is_named_and_read_once(write: Write, tmp_path: Path, reads: list[str]) -> None:
