@@ -211,8 +211,8 @@ class UnitRun(UnitSession):
 
     def _aborted(self, e: BaseException) -> Ending:
         ending = aborted(e, self._provisioning)
-        if ending.code is Code.LOST and self._recording is None:  # it was never there
-            ending = replace(ending, code=Code.ABSENT)
+        if ending.code in (Code.LOST, Code.ABSENT):  # without a recording it was never there
+            ending = replace(ending, code=Code.ABSENT if self._recording is None else Code.LOST)
         if self.stopped_for is not None and isinstance(e, asyncio.CancelledError):
             return replace(ending, reason=f"stopped: {self.stopped_for}")
         return ending
