@@ -29,13 +29,14 @@ from triaxcald.audit.results import (
     held_in,
     outcome_again,
     report_of,
+    was_killed,
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
-from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Code, Verdict, digest_of
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.manifest import is_manifest
@@ -145,7 +146,7 @@ class _Audit:
         self._check_outcome(found, again)
         if again is not None:
             self._check_results(again)
-            self._differences += previews.check(self._recording, again.previews)
+            self._differences += previews.check(self._recording, again.previews, cut_short=self._mended)
         self._check_raw()
         self._differences += contents.faults(found)
         if self._outcome:
@@ -335,6 +336,7 @@ class _Audit:
             aborted=self._aborted,
             provisioned=self._check_events(again),
             rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
+            killed=was_killed(self._outcome),
         )
         if again.written and not self._aborted and self._outcome and said.told is None:
             self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")
@@ -363,7 +365,7 @@ class _Audit:
         if again.written and not self._aborted and provisioned is None:
             self._add(EVENTS, Kind.MISSING, "provisioned")
         if self._outcome:
-            killed = self._outcome.get("code") == Code.KILLED  # which wrote no event any more
+            killed = was_killed(self._outcome)  # it wrote no event any more
             reason = self._outcome.get("reason") if self._aborted and not killed else None
             if failed != reason:
                 self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 from pydantic import TypeAdapter
 
 from tests.daemon.audit.forging import Forgery
@@ -20,6 +21,7 @@ from tests.virtual_line import described, virtual_line
 from triaxcald.audit import audit
 from triaxcald.cli.events import EventLines
 from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.recording.reader import Recording
 from triaxcald.run.attempts import FOLDER, Attempts, settle_killed
 from triaxcald.run.unit_run import Outcome, run_station
 from triaxcald.schema.codes import Stage
@@ -212,6 +214,44 @@ def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Kill
         names = [r.name for r in Forgery.of(recording).records if hasattr(r, "media_type")]
         assert names[-1] == "outcome.json"
         assert not {"certificate.json", "report.html"} & set(names)
+
+
+def _parts_written(recording: Path) -> list[int]:
+    """Where each attachment of the writing ends, and the next chunk after it."""
+    with open(recording, "rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = [c.chunk_start_offset + c.chunk_length for c in summary.chunk_indexes]
+    names = ("registers-before.json", "registers-after.json", "verification.json")
+    ends = [a.offset + a.length for a in summary.attachment_indexes if a.name in names]
+    return sorted({*ends, *(chunk for end in ends for chunk in [c for c in chunks if c > end][:1])})
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_while_it_wrote_registers_is_audited(finished_run: Any, tmp_path: Path) -> None:
+    """Whichever part of its recording was the last on the disk."""
+    with Recording.open(finished_run.modbus) as recording:
+        run, work = recording.metadata["run"], recording.metadata["work"]
+        station_file = recording.attachments["station.toml"]
+    ends = _parts_written(finished_run.modbus)
+    assert len(ends) == 5
+    seen = set()
+    for number, end in enumerate(ends):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "station.toml").write_bytes(station_file)
+        killed = Killed(folder, folder / "station.toml", finished_run.modbus)
+        killed.attempt = Attempt(run["run"], run["started"], Work.recorded(work))
+        journal = folder / "journal" / "TRIAX-REF-4712.json"
+        journal.parent.mkdir()
+        journal.write_text("{}")
+        killed.leave(end, serial="4712")
+        held = killed.settled()
+        assert (held["code"], held["device_state"]) == ("killed", "unknown")
+        found = audit(folder / held["recording"])
+        assert found.differences == (), end
+        seen |= set(found.checked)
+    assert {"registers-after.json", "verification.json"} <= seen
 
 
 def test_an_attempt_that_was_killed_before_its_recording_gets_an_outcome(killed: Killed) -> None:
