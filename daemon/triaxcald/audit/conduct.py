@@ -29,13 +29,14 @@ from triaxcald.audit.results import (
     held_in,
     outcome_again,
     report_of,
+    was_killed,
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
-from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Code, Verdict, digest_of
+from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.manifest import is_manifest
@@ -145,7 +146,7 @@ class _Audit:
         self._check_outcome(found, again)
         if again is not None:
             self._check_results(again)
-            self._differences += previews.check(self._recording, again.previews)
+            self._differences += previews.check(self._recording, again.previews, cut_short=self._mended)
         self._check_raw()
         self._differences += contents.faults(found)
         if self._outcome:
@@ -177,10 +178,6 @@ class _Audit:
 
     def _add(self, part: str, kind: Kind, place: str = "", **values: Any) -> None:
         self._differences.append(Difference(part, kind, place, **values))
-
-    @property
-    def _killed(self) -> bool:
-        return self._outcome.get("code") == Code.KILLED
 
     def _again(self) -> Again | None:
         try:
@@ -337,9 +334,9 @@ class _Audit:
             held=held_in(self._outcome) if self._outcome else None,
             forced=self._outcome.get("forced") is not None or not self._outcome,
             aborted=self._aborted,
-            killed=self._killed,
             provisioned=self._check_events(again),
             rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
+            killed=was_killed(self._outcome),
         )
         if again.written and not self._aborted and self._outcome and said.told is None:
             self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")
@@ -369,7 +366,8 @@ class _Audit:
             self._add(EVENTS, Kind.MISSING, "provisioned")
         if self._outcome:
             reason = self._outcome.get("reason") if self._aborted else None
-            if failed != reason and not self._killed:  # the process may have told another reason, or none
+            # A killed process may have told another reason, or none.
+            if failed != reason and not was_killed(self._outcome):
                 self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)
             state = self._outcome.get("device_state")
             undone = self._outcome.get("verdict") == Verdict.FAIL.value and again.written

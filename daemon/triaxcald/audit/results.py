@@ -274,6 +274,11 @@ def report_of(again: Again, ending: Ending, held: Held) -> str:
     return unit_report(again.certified, again.readings, ending, again.verification if again.checked else None, held)
 
 
+def was_killed(outcome: Mapping[str, Any]) -> bool:
+    """Whether the next start wrote the outcome, which then has no figures."""
+    return outcome.get("code") == Code.KILLED
+
+
 def outcome_again(
     stored: Mapping[str, Any],
     again: Again,
@@ -297,7 +302,7 @@ def outcome_again(
     certificate = again.certified.document if again.certified else None
     if aborted and stored.get("measured") is None:  # it did not come to a fit
         certificate = None
-    checked = again.checked and not aborted
+    checked = VERIFICATION_FILE in recording.attachments or (again.checked and not aborted)
     unit = recording.metadata.get("unit", {})
     named = recording.metadata.get("software", {})
     document = outcome_document(
@@ -305,7 +310,7 @@ def outcome_again(
         held_in(stored) or Held(),
         Papers(
             measured=measured_in(certificate) if certificate else None,
-            verification=again.verification if VERIFICATION_FILE in recording.attachments or checked else None,
+            verification=again.verification if checked and not was_killed(stored) else None,
             registers=RegistersDone.read(stored.get("registers")),
             limits=again.station.limits.model_dump(),
             outside=certificate["outside"] if certificate else (),

@@ -154,7 +154,7 @@ class Said:
     such event."""
     rules: Rules = Rules.MARK_OR_SUPPLY
     killed: bool = False
-    """Whether the process was killed, and the next start has written the outcome."""
+    """A killed process told nothing of what it wrote."""
 
     @property
     def old(self) -> Raw | None:
@@ -229,7 +229,7 @@ def _after(traffic: Traffic, said: Said) -> list[Difference]:
         for name, raw in said.new.items()
         if said.after.get(name) != raw
     ]
-    if said.provisioned is None:
+    if said.provisioned is None and not said.killed:
         found.append(Difference(REGISTERS, Kind.NOT_SHOWN, "provisioned", REGISTERS_AFTER))
     if found or any(s.raw == said.after for s in traffic.snapshots):
         return found
@@ -246,8 +246,6 @@ def _unequal(part: str, stored: Raw, read: Raw) -> list[Difference]:
 
 def _told(traffic: Traffic, said: Said) -> list[Difference]:
     """What the outcome, or the event alone, says was written."""
-    if said.killed:  # the outcome was written by the next start, which knows no register
-        return []
     written = _names(said.told.get("written")) if said.told else said.provisioned
     found: list[Difference] = []
 
@@ -258,7 +256,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
     image = said.new
     seen = list(dict.fromkeys(a.register for _, a in traffic.writes if a.raw == image.get(a.register)))
     if written is None:
-        return [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
+        return [] if said.killed else [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
     # A stop may come between a request and its record; an undoing may write
     # what is old and new alike.
     cut = said.aborted and seen == list(written[:-1])

@@ -139,6 +139,7 @@ class RecordingFile:
 
     def attach(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
         self.inventory.attachment(name, media_type, time_ns, data)
+        self._mcap.flush()  # type: ignore[no-untyped-call]  # first the records that the attachment rests on
         self._mcap.add_attachment(time_ns, time_ns, name, media_type, data)
         self.flush()
 

@@ -41,7 +41,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import Sealed, recover
 from triaxcald.recording.survey import survey
 from triaxcald.software import software
-from triaxcald.station.config import Station
+from triaxcald.station.config import Limits, Station
 from triaxcald.store import History
 from triaxcald.work import Attempt, Work, wrong
 
@@ -60,13 +60,14 @@ PAPERS: Final = (CERTIFICATE, REPORT)
 
 @dataclass
 class AttemptFile:
-    """The file of an attempt under way. ``serial`` is the number that the unit itself
+    """The file of an attempt under way, at a station with these ``limits``. ``serial`` is the number that the unit itself
     has told, ``journal`` the path of a journal that an earlier run has left, ``held``
     the state of the device once a provisioning is settled."""
 
     path: Path
     tray: str
     station: str
+    limits: Mapping[str, float | None]
     attempt: Attempt
     serial: str | None = None
     journal: str | None = None
@@ -79,6 +80,7 @@ class AttemptFile:
             "format": FORMAT,
             "tray": self.tray,
             "station": self.station,
+            "limits": dict(self.limits),
             "run": self.attempt.run,
             "started": self.attempt.started,
             "recording": self.attempt.recording,
@@ -112,6 +114,7 @@ class AttemptFile:
                 path,
                 str(held["tray"]),
                 str(held["station"]),
+                Limits.model_validate(held["limits"]).model_dump(),
                 Attempt(
                     str(held["run"]),
                     str(held["started"]),
@@ -138,6 +141,7 @@ class Attempts:
     folder: Path
     tray: str
     station: str
+    limits: Mapping[str, float | None] = field(default_factory=dict)
     _lock: int | None = field(default=None, init=False)
 
     @property
@@ -167,7 +171,9 @@ class Attempts:
 
     def begin(self, attempt: Attempt, journal: str | None = None) -> AttemptFile:
         """The file of an attempt that begins, on the disk. Raises DiskError."""
-        file = AttemptFile(self._within / f"{attempt.run}.json", self.tray, self.station, attempt, journal=journal)
+        file = AttemptFile(
+            self._within / f"{attempt.run}.json", self.tray, self.station, self.limits, attempt, journal=journal
+        )
         file.write()
         return file
 
@@ -353,7 +359,7 @@ def _document(
         outcome_document(
             Ending(Code.KILLED.verdict, text.KILLED, -1, Code.KILLED),
             held,
-            Papers(limits=station.file.limits.model_dump(), contents=contents),
+            Papers(limits=file.limits, contents=contents),
             unit=attempt.work.slot,
             serial=file.serial,
             station=file.station,

@@ -153,7 +153,7 @@ class UnitRun(UnitSession):
         error."""
         if self._attempts is not None:
             return await self._run(self._attempts)
-        tray = Attempts(self.station.folder, self.id, self.station.file.name)
+        tray = _attempts_at(self.station, self.id)
         try:
             with tray.under_way():
                 return await self._run(tray)
@@ -219,8 +219,8 @@ class UnitRun(UnitSession):
 
     def _aborted(self, e: BaseException) -> Ending:
         ending = aborted(e, self._provisioning)
-        if ending.code is Code.LOST and not self._answered:  # it was never there
-            ending = replace(ending, code=Code.ABSENT)
+        if ending.code in (Code.LOST, Code.ABSENT):  # by the last attempt to reach it
+            ending = replace(ending, code=Code.LOST if self._answered else Code.ABSENT)
         if self.stopped_for is not None and isinstance(e, asyncio.CancelledError):
             return replace(ending, reason=f"stopped: {self.stopped_for}")
         return ending
@@ -633,7 +633,7 @@ class TrayRun:
         self.id = new_run_id()
         self._station, self._ended, self._killed, self._begun = station, ended, killed, begun
         self._serials, self._others = SerialsSeen(), ActiveUnits(len(station.places))
-        self._attempts = Attempts(station.folder, self.id, station.file.name)
+        self._attempts = _attempts_at(station, self.id)
         self._start = Start({place.unit.name for place in station.places}, self._open)
         tray = _tray_of(station)
         self._shown = None if tray is None else TrayProgress(progress, tray)
@@ -690,6 +690,10 @@ def run_station(
 ) -> TrayRun:
     """The units of a station, to be awaited; arguments as in `TrayRun`."""
     return TrayRun(station, progress, force=force, rezero=rezero, work=work, ended=ended, killed=killed, begun=begun)
+
+
+def _attempts_at(station: Station, tray: str) -> Attempts:
+    return Attempts(station.folder, tray, station.file.name, station.file.limits.model_dump())
 
 
 def _tray_of(station: Station) -> Tray | None:

@@ -175,7 +175,8 @@ def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     assert triaxcal("poses", path, "--json").json["poses"]
     triaxcal("fit", path).failed(3, "refused: ")
     ended = _outcome(path)
-    assert (ended["verdict"], ended["device_state"], ended["measured"]) == ("aborted", "untouched", None)
+    assert (ended["verdict"], ended["code"], ended["device_state"]) == ("aborted", "lost", "untouched")
+    assert ended["measured"] is None
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 from pydantic import TypeAdapter
 
 from tests.daemon.audit.forging import Forgery
@@ -32,6 +33,8 @@ from triaxcald.station.config import load_station
 from triaxcald.work import Attempt, Work
 
 EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+LIMITS = {"rms_g": 1e-4, "cross_validated_rms_g": None, "verification_rms_g": 1e-4}
+"""Of the finished run."""
 PLAN = {"poses": 9, "hold_s": 1.0, "check_poses": 3}
 
 
@@ -222,7 +225,7 @@ class Killed:
         self.attempt = Attempt(told["run"], told["started"], work)
 
     def leave(self, cut: int | None, **more: Any) -> None:
-        tray = Attempts(self.folder, "0193f0e4-0000-7000-8000-00000000000f", "bench")
+        tray = Attempts(self.folder, "0193f0e4-0000-7000-8000-00000000000f", "bench", LIMITS)
         name = "modbus-4712-20260302T090000Z.mcap"
         with contextlib.suppress(OSError):
             (self.folder / FOLDER).mkdir()
@@ -270,6 +273,44 @@ def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Kill
         assert names[-1] == "outcome.json"
         assert not {"certificate.json", "report.html"} & set(names)
         assert audit(recording).differences == ()
+
+
+def _parts_written(recording: Path) -> list[int]:
+    """Where each attachment of the writing ends, and the next chunk after it."""
+    with open(recording, "rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = [c.chunk_start_offset + c.chunk_length for c in summary.chunk_indexes]
+    names = ("registers-before.json", "registers-after.json", "verification.json")
+    ends = [a.offset + a.length for a in summary.attachment_indexes if a.name in names]
+    return sorted({*ends, *(chunk for end in ends for chunk in [c for c in chunks if c > end][:1])})
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_while_it_wrote_registers_is_audited(finished_run: Any, tmp_path: Path) -> None:
+    """Whichever part of its recording was the last on the disk."""
+    with Recording.open(finished_run.modbus) as recording:
+        run, work = recording.metadata["run"], recording.metadata["work"]
+        station_file = recording.attachments["station.toml"]
+    ends = _parts_written(finished_run.modbus)
+    assert len(ends) == 5
+    seen = set()
+    for number, end in enumerate(ends):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "station.toml").write_bytes(station_file)
+        killed = Killed(folder, folder / "station.toml", finished_run.modbus)
+        killed.attempt = Attempt(run["run"], run["started"], Work.recorded(work))
+        journal = folder / "journal" / "TRIAX-REF-4712.json"
+        journal.parent.mkdir()
+        journal.write_text("{}")
+        killed.leave(end, serial="4712")
+        held = killed.settled()
+        assert (held["code"], held["device_state"]) == ("killed", "unknown")
+        found = audit(folder / held["recording"])
+        assert found.differences == (), end
+        seen |= set(found.checked)
+    assert {"registers-after.json", "verification.json"} <= seen
 
 
 def test_an_attempt_that_was_killed_before_its_recording_gets_an_outcome(killed: Killed) -> None:
