@@ -18,6 +18,7 @@ from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.simulation.unit import Stored, factory_calibration
+from triaxcald.text import VERDICTS
 
 ENDLESS = {"poses": 26, "hold_s": 1.0, "patience_s": 1e6}
 """More poses than the fixture of the simulated unit takes: such a run goes on for ever."""
@@ -162,6 +163,6 @@ def test_a_unit_whose_process_dies_in_mid_recording_is_an_error(
     (unit,) = json.loads(process.out)["units"]
     assert unit["exit_code"] == 4
     assert "unit rec: " in unit["error"]
-    assert process.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
+    assert process.err.splitlines()[-1] == f"triaxcal: {VERDICTS[unit['outcome']['verdict']]} {unit['error']}"
     assert triaxcal("log", "info", unit["recording"], "--json").json["finished"] is True
     assert triaxcal("audit", unit["recording"]).code == 0

@@ -60,9 +60,10 @@ PAPERS: Final = (CERTIFICATE, REPORT)
 
 @dataclass
 class AttemptFile:
-    """The file of an attempt under way, at a station with these ``limits``. ``serial`` is the number that the unit itself
-    has told, ``journal`` the path of a journal that an earlier run has left, ``held``
-    the state of the device once a provisioning is settled."""
+    """The file of an attempt under way, at a station with these ``limits``. ``serial``
+    is the number that the unit itself has told, ``journal`` the path of a journal that
+    an earlier run has left, ``held`` the state of the device once a provisioning is
+    settled."""
 
     path: Path
     tray: str
@@ -171,9 +172,8 @@ class Attempts:
 
     def begin(self, attempt: Attempt, journal: str | None = None) -> AttemptFile:
         """The file of an attempt that begins, on the disk. Raises DiskError."""
-        file = AttemptFile(
-            self._within / f"{attempt.run}.json", self.tray, self.station, self.limits, attempt, journal=journal
-        )
+        path = self._within / f"{attempt.run}.json"
+        file = AttemptFile(path, self.tray, self.station, self.limits, attempt, journal=journal)
         file.write()
         return file
 
@@ -390,9 +390,11 @@ def _journal(folder: Path, file: AttemptFile) -> Path | None:
     if file.journal is not None and Path(file.journal).exists():
         return Path(file.journal)
     for path in sorted((folder / JOURNALS).glob("*.json")):
-        with suppress(OSError, InputError):
+        try:
             if parse(path.read_bytes(), where=str(path)).run == file.attempt.run:
                 return path
+        except (OSError, InputError):  # it may be of this run
+            return path
     return None
 
 

@@ -20,6 +20,7 @@ from triaxcald.provision.state import Evidence
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
+from triaxcald.text import VERDICTS
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
@@ -221,7 +222,7 @@ def test_two_signals_in_the_check_poses_do_not_keep_the_old_calibration_away(
     (unit,) = done.json["units"]
     assert (unit["exit_code"], unit["outcome"]["device_state"]) == (130, "old")
     assert unit["error"] == f"unit unit0: interrupted; {unit['device_state']}"
-    assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
+    assert done.err.splitlines()[-1] == f"triaxcal: {VERDICTS[unit['outcome']['verdict']]} {unit['error']}"
     with Recording.open(Path(unit["recording"])) as recording:
         assert recording.finished
         assert "registers-before.json" in recording.attachments
@@ -264,7 +265,7 @@ def test_a_device_that_could_not_be_put_back_after_an_interruption_is_4_and_said
     assert (unit["outcome"]["verdict"], unit["outcome"]["device_state"]) == ("aborted", "new_verified")
     assert unit["error"].startswith(f"unit unit0: interrupted; {unit['device_state']}; to settle: ")
     assert Path(unit["outcome"]["journal"]).exists()
-    assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
+    assert done.err.splitlines()[-1] == f"triaxcal: {VERDICTS[unit['outcome']['verdict']]} {unit['error']}"
 
 
 @pytest.mark.slow

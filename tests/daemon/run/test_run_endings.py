@@ -24,6 +24,7 @@ from triaxcald.schema.codes import Stage
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
 from triaxcald.station.config import load_station
+from triaxcald.text import VERDICTS
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
@@ -142,7 +143,7 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
     (unit,) = done.json["units"]
     assert (unit["exit_code"], unit["outcome"]["device_state"]) == (5, "new_verified")
     assert "No space left on device" in unit["error"]
-    assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
+    assert done.err.splitlines()[-1] == f"triaxcal: {VERDICTS[unit['outcome']['verdict']]} {unit['error']}"
     assert unit["error"].endswith(NEW)
     if where == "closing":  # the recording cannot vouch for what was drawn
         (beside,) = [path for path in workshop.folder.glob("unit0-*") if path.suffix != ".mcap"]

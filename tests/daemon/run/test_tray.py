@@ -258,10 +258,16 @@ def killed(finished_run: Any, tmp_path: Path) -> Killed:
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.37, 0.5, 0.73, 0.9, 0.99])
 def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Killed, share: float) -> None:
     killed.leave(round(len(killed._whole) * share), serial="4712")
+    writing = share > 0.7  # of this recording, by its registers
+    if writing:
+        journal = Journal(killed.folder / "journal" / "TRIAX-REF-4712.json")
+        journal.write(Entry("modbus", "4712", "0" * 64, "2026", {}, {}, run=killed.attempt.run))
     held = killed.settled()
     assert (held["verdict"], held["code"], held["exit_code"]) == ("aborted", "killed", None)
     assert (held["run"], held["serial"], held["work"]["attempt"]) == (killed.attempt.run, "4712", 1)
-    assert (held["device_state"], held["journal"]) == ("untouched", None)
+    assert (held["device_state"], held["journal"] is not None) == (
+        ("unknown", True) if writing else ("untouched", False)
+    )
     recordings = list(killed.folder.glob("*.mcap"))
     if held["recording"] is None:  # not even its head was there: what is left of it is kept
         assert recordings == []
