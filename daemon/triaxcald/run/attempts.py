@@ -257,6 +257,9 @@ def _settle(station: Station, file: AttemptFile) -> Killed | None:
     if recording is not None:
         try:
             document = _mended(station, file, attempt, recording)
+            if document is None and _has_outcome(station.folder, file, recording):
+                file.remove()
+                return None
         except (RecordingError, tc.Refused):  # nothing in it can be read: it is kept, and is no recording
             os.replace(recording, recording.with_suffix(DAMAGED))
             attempt = replace(attempt, recording=None)
@@ -314,20 +317,32 @@ def _run(outcome: bytes) -> str | None:
         return None
 
 
-def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Path) -> dict[str, Any]:
-    """Mend the recording, with the outcome as its last attachment. Raises
-    RecordingError, Refused, InputError."""
+def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Path) -> dict[str, Any] | None:
+    """Mend the recording, with the outcome as its last attachment; None if the killed
+    process had stored its outcome there, which is final. Raises RecordingError,
+    Refused, InputError."""
     draft, mended = (recording.with_suffix(f".mcap.{kind}") for kind in ("draft", "mended"))
     for path in (draft, mended):
         path.unlink(missing_ok=True)  # of a start that was killed itself
+    document: dict[str, Any] | None = None
+    without: tuple[str, ...]
     try:
-        # Once without the outcome, which lists what is in the file before it.
-        recover(recording, draft, without=PAPERS)
+        recover(recording, draft)
         with Recording.open(draft) as found:
-            contents = survey(found, ATTACHMENT).inventory.document()
-        document = _document(station, file, attempt, contents)
-        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), to_text(document).encode())
-        recovery = recover(recording, mended, without=PAPERS, sealed=sealed)
+            stored = found.attachments[ATTACHMENT] if ATTACHMENT in found.attachments else None
+        if stored is not None and _run(stored) == attempt.run:
+            outcome, without = stored, (ATTACHMENT,)
+        else:
+            # Once without the outcome, which lists what is in the file before it.
+            draft.unlink()
+            without = (ATTACHMENT, *PAPERS)
+            recover(recording, draft, without=without)
+            with Recording.open(draft) as found:
+                contents = survey(found, ATTACHMENT).inventory.document()
+            document = _document(station, file, attempt, contents)
+            outcome = to_text(document).encode()
+        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), outcome)
+        recovery = recover(recording, mended, without=without, sealed=sealed)
         if not recovery.lossless:  # what could not be read may be read by somebody else
             _keep(recording)
         os.replace(mended, recording)
