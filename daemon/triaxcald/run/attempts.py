@@ -329,7 +329,7 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
     try:
         recover(recording, draft)
         with Recording.open(draft) as found:
-            stored = found.attachments[ATTACHMENT] if ATTACHMENT in found.attachments else None
+            stored = found.attachments.get(ATTACHMENT)
         if stored is not None and _run(stored) == attempt.run:
             outcome, without = stored, (ATTACHMENT,)
         else:

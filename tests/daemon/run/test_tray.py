@@ -255,7 +255,7 @@ def killed(finished_run: Any, tmp_path: Path) -> Killed:
     return Killed(tmp_path, station, finished_run.modbus)
 
 
-@pytest.mark.parametrize("share", [0.001, 0.1, 0.37, 0.5, 0.73, 0.9, 0.99])
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.37, 0.5, 0.73, 0.9])
 def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Killed, share: float) -> None:
     killed.leave(round(len(killed._whole) * share), serial="4712")
     writing = share > 0.7  # of this recording, by its registers
@@ -265,9 +265,8 @@ def test_a_killed_run_gets_its_outcome_and_its_recording_is_audited(killed: Kill
     held = killed.settled()
     assert (held["verdict"], held["code"], held["exit_code"]) == ("aborted", "killed", None)
     assert (held["run"], held["serial"], held["work"]["attempt"]) == (killed.attempt.run, "4712", 1)
-    assert (held["device_state"], held["journal"] is not None) == (
-        ("unknown", True) if writing else ("untouched", False)
-    )
+    state = "unknown" if writing else "untouched"
+    assert (held["device_state"], held["journal"] is not None) == (state, writing)
     recordings = list(killed.folder.glob("*.mcap"))
     if held["recording"] is None:  # not even its head was there: what is left of it is kept
         assert recordings == []
@@ -333,6 +332,18 @@ def test_a_run_that_was_killed_after_its_end_keeps_its_own_outcome(killed: Kille
     own = next(r.data for r in Forgery.of(next(killed.folder.glob("*.mcap"))).records if _is_outcome(r))
     assert outcome.read_bytes() == own
     assert not (killed.folder / FOLDER).exists()
+
+
+def test_a_run_that_was_killed_before_the_end_of_its_file_keeps_its_own_outcome(killed: Killed) -> None:
+    """Its outcome is stored in the recording, whose indexes are missing."""
+    killed.leave(len(killed._whole) - 100, serial="4712")
+    assert settle_killed(load_station(killed.station)) == []
+    (recording,) = killed.folder.glob("*.mcap")
+    held = {r.name: r.data for r in Forgery.of(recording).records if hasattr(r, "media_type")}
+    for name in "outcome.json", "certificate.json", "report.html":
+        assert recording.with_suffix(f".{name}").read_bytes() == held[name]
+    assert json.loads(held["outcome.json"])["verdict"] == "pass"
+    assert audit(recording).differences == ()
 
 
 def _is_outcome(record: Any) -> bool:
