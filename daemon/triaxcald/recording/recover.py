@@ -323,6 +323,8 @@ class _Recoverer:
         if record.name == schema.RAW_RECORD:
             self._written = record.metadata
             return
+        if record.name == schema.END_RECORD and self._sealed is not None:
+            return  # the new file has its own
         if record.name != schema.FORMAT_RECORD:  # a wrong byte in it would make the new file unreadable
             self._mcap.add_metadata(record.name, record.metadata)
         elif record.metadata.get(schema.ENDS_WITH):
