@@ -46,11 +46,13 @@ bus = {bus}
 UNITS: dict[str, dict[str, Any]] = {
     "can-second-order": {
         "profile": "triax-ref-can",
+        "seed": 20,
         "bus": {"interface": "virtual", "channel": "golden", "node_id": 5},
         "sensor": {"effects": {"second_order_nonlinearity": {"x": 6e-4, "y": -4e-4, "z": 5e-4}}},
     },
     "modbus-temperature-bias": {
         "profile": "triax-ref-modbus",
+        "seed": 22,
         "bus": {"host": "127.0.0.1", "port": 0, "unit_id": 1},
         "sensor": {"effects": {"temperature_bias": {"x": 4e-5, "y": 5e-5, "z": -6e-5}}},
         "surroundings": {"swing_c": 6.0, "swing_period_s": 17.0},
@@ -64,7 +66,6 @@ def device_of(name: str) -> DeviceFile:
             "format": "triaxcal.device/1",
             "serial": 1001 + list(UNITS).index(name),
             "speed": 10.0,
-            "seed": 20,
             "fixture": {"hold_s": 2.4, "move_s": 0.8},
             **UNITS[name],
         },
