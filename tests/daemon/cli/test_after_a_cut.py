@@ -17,6 +17,7 @@ from tests.devices.place import Trouble
 from tests.devices.profiles import Timing
 from tests.devices.table import OLD
 from triaxcald.cli import provisioning
+from triaxcald.schema.codes import Stage
 
 QUICK = Timing(reply_s=0.3, silence_s=0.6)
 CUT = Habits(cut_at_byte=17)
@@ -100,7 +101,12 @@ def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
         assert f"'triaxcal restore {journal} {bench.station} --unit unit --power-cycle'" in done.out
         assert journal.exists()
         bench.unit.habits = replace(bench.unit.habits, restart_s=2.0)  # so long its supply is off
-        monkeypatch.setattr(provisioning, "_ask", lambda _: threading.Timer(0.3, bench.power_cycle).start())
+
+        def ask(stage: Stage, _: str) -> None:
+            if stage is Stage.POWER_OFF:
+                threading.Timer(0.3, bench.power_cycle).start()
+
+        monkeypatch.setattr(provisioning, "_ask", ask)
         done = triaxcal("restore", journal, bench.station, "--power-cycle")
         assert "read back after a power cycle" in done.out
         assert bench.holds_old()

@@ -13,6 +13,7 @@ from tests.devices.bench import Bench
 from tests.devices.habits import Habits
 from tests.devices.rows import ROWS, Row
 from triaxcald.cli import provisioning
+from triaxcald.schema.codes import Stage
 
 SCRIPT = Path(__file__).parents[3] / "docs/reference/misbehaving-devices.py"
 
@@ -29,7 +30,12 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_said_of_a_device_that(row: Row, tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch) -> None:
     with Bench(tmp_path, triaxcal, row.transport, **row.settings) as bench:
         if row.supply:
-            monkeypatch.setattr(provisioning, "_ask", lambda _: threading.Timer(0.3, bench.power_cycle).start())
+
+            def ask(stage: Stage, _: str) -> None:
+                if stage is Stage.POWER_OFF:
+                    threading.Timer(0.3, bench.power_cycle).start()
+
+            monkeypatch.setattr(provisioning, "_ask", ask)
         done = bench.provision("--json", *row.arguments)
         outcome = done.json["outcome"]
         said = f"{outcome['reason']} {done.err}"

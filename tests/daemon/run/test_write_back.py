@@ -78,10 +78,17 @@ class Bench:
     device: Device
     writer: RecordingWriter
     image: RegisterImage
-    asked: list[str] = field(default_factory=list)
+    asked: list[Stage] = field(default_factory=list)
 
     def write_back(self, collect: Callable[[Collection], Awaitable[None]]) -> WriteBack:
-        return WriteBack(self.place, self.station, self.writer, collect, ask=self.asked.append, started="today")
+        return WriteBack(
+            self.place,
+            self.station,
+            self.writer,
+            collect,
+            ask=lambda stage, _: self.asked.append(stage),
+            started="today",
+        )
 
     async def run(self, back: WriteBack) -> None:
         acquisition = Collection(CALIBRATION_POSES, self.place.bundle, self.place.address)
