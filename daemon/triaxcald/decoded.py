@@ -28,10 +28,15 @@ _CALLED = {
 }
 
 
+READING_MOST = 1e100
+"""As `tc.poses.READING_MOST`, whose room loads scipy: a command that decodes alone does
+without."""
+
+
 def only_finite(block: td.SampleBlock) -> td.SampleBlock:
     """Without the samples that hold no reading: a float register, or a message,
     may hold NaN or rubbish."""
-    finite = np.asarray((np.abs(block.readings) < tc.poses.READING_MOST).all(axis=1))
+    finite = np.asarray((np.abs(block.readings) < READING_MOST).all(axis=1))
     return block if finite.all() else replace(block.only(finite), not_finite=int((~finite).sum()))
 
 

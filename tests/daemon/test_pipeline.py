@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import triaxcal as tc
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import QualityDetector, QualityFinding
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.catalogue import load_bundle, parse_bundle
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import CORRECTED, READINGS
-from triaxcald import text
+from triaxcald import decoded, text
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
 from triaxcald.pipeline import Pipeline, together
 from triaxcald.recording.schema import cut
@@ -239,3 +240,7 @@ def test_the_hosts_time_is_kept_beside_the_units(records: list[tuple[int, int, i
     said = text.own_seconds(stream.seconds, stream.host_seconds)
     assert said == "20.0 s of the unit's own time (25.0 s by the host's clock)"
     assert text.own_seconds(20.0, 21.0) == "20.0 s"
+
+
+def test_the_daemon_and_the_metrology_take_the_same_readings_for_sound() -> None:
+    assert decoded.READING_MOST == tc.poses.READING_MOST

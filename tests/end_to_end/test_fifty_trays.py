@@ -381,7 +381,11 @@ class Factory:
 
         asyncio.run(all_units())
         found = {d["unit"]: d["code"] for d in self.ended[-len(slots) :]}
-        assert found == {name: slot.code for name, slot in slots.items()}, (number, limits, self.ended[-len(slots) :])
+        wanted = {name: slot.code for name, slot in slots.items()}
+        if any(slot.fault == "one serial twice" for slot in slots.values()):  # whoever answers first keeps the number
+            assert sorted(found.values()) == sorted(wanted.values()), (number, limits, self.ended[-len(slots) :])
+        else:
+            assert found == wanted, (number, limits, self.ended[-len(slots) :])
         for name, slot in slots.items():
             if slot.fault not in ("nonsense", "another unit"):
                 self._stock[slot.holds] = self._units[name].eeprom

@@ -238,7 +238,7 @@ def test_record_ends_with_5_and_says_up_to_when_the_file_is_sound(workshop: Any,
         )  # fmt: skip
     assert done.returncode == DISK, done.stderr
     last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"triaxcal: STOPPED unit unit0: {path}: writing failed: File too large; sound up to 20")
+    assert last.startswith(f"triaxcal: unit unit0: {path}: writing failed: File too large; sound up to 20")
     with Recording.open(path, unfinished=True) as recording:
         assert recording.size <= 150_000
         assert recording.raw_digest().records > 0
