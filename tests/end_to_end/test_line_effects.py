@@ -30,7 +30,7 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
     assert "bias_step" in done.out
     (certificate,) = workshop.folder.glob("*.certificate.json")
     found = json.loads(certificate.read_text())["result"]["calibration"]["effects"]["bias_step"]
-    assert set(found) == set(STEP)
+    assert set(found) == {*STEP, "weight"}
     for name, truth in STEP.items():
         coefficient = found[name]
         late = START_S if name == "at" else 0.0
