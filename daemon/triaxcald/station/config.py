@@ -163,6 +163,27 @@ class WorkDefaults(td.Strict):
     fixture: WorkText | None = None
 
 
+class Receiver(td.Strict):
+    """Where the service delivers each result (`triaxcal.result/1`)."""
+
+    name: Annotated[str, Field(pattern=NAME)]
+    url: Annotated[str | None, Field(pattern=r"^https?://\S+$", description="receives each result by POST")] = None
+    folder: Annotated[PathText | None, Field(description="receives each result as a file, beside the station file")] = (
+        None
+    )
+    token_file: Annotated[
+        PathText | None, Field(description="file with the bearer token for `url`, beside the station file")
+    ] = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.url is None) == (self.folder is None):
+            raise ValueError("url or folder: give one of them")
+        if self.token_file is not None and self.url is None:
+            raise ValueError("token_file: only a url takes a token")
+        return self
+
+
 class Unit(td.Strict):
     name: Annotated[str, Field(pattern=NAME)]
     profile: Annotated[
@@ -221,6 +242,7 @@ class StationFile(td.Strict):
     fixture: Fixture = Fixture()
     rules: Rules = Rules()
     work: WorkDefaults = WorkDefaults()
+    deliver: Annotated[tuple[Receiver, ...], Field(description="receivers of each result, for the service alone")] = ()
     buses: Annotated[
         tuple[Bus, ...],
         Field(max_length=BUSES_MOST, description="listened to by `record`: all their frames"),
@@ -283,6 +305,10 @@ class StationFile(td.Strict):
             for name in names:
                 if names.count(name) > 1:
                     raise ValueError(f"{key}: the name '{name}' is given twice")
+        receivers = [receiver.name for receiver in self.deliver]
+        for name in receivers:
+            if receivers.count(name) > 1:
+                raise ValueError(f"deliver: the name '{name}' is given twice")
         for name in buses:
             if unit := taken_for(name, units):
                 raise ValueError(f"buses: recordings of unit {unit} may be called '{name}'")
