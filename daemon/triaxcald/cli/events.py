@@ -9,15 +9,14 @@ import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
 from triaxcald.printable import printable_json
+from triaxcald.run.events import Events
 from triaxcald.schema.codes import Stage
 
 if TYPE_CHECKING:
     from triaxcald.recording.schema import Phase
-    from triaxcald.run.unit_run import Outcome
     from triaxcald.schema.codes import Code
     from triaxcald.station.collection import Progress
     from triaxcald.station.guidance import Guide
@@ -27,23 +26,16 @@ DRAIN_S = 30.0
 """Longest wait at the end for a reader that does not read."""
 
 
-def _now() -> datetime:
-    return datetime.now(UTC)
-
-
-class EventLines:
+class EventLines(Events):
     """Writes each event at once, on a thread of its own: a reader that is slow or gone
     stops no measurement. ``write`` takes the bytes of a line; it may block, and raises
     OSError. ``runs`` maps the slots to the ids of their runs."""
 
-    def __init__(
-        self, write: Callable[[bytes], object], tray: str, runs: Mapping[str, str], now: Callable[[], datetime] = _now
-    ) -> None:
-        self._write, self._tray, self._runs, self._now = write, tray, runs, now
-        self._seq = 0
-        self._latest: dict[str, object] = {}
+    def __init__(self, write: Callable[[bytes], object], tray: str, runs: Mapping[str, str]) -> None:
+        self._write, self._seq = write, 0
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="events", daemon=True)
+        super().__init__(self._put, tray, runs, number=self._following)
 
     def __enter__(self) -> EventLines:
         self._thread.start()
@@ -51,72 +43,19 @@ class EventLines:
 
     def __exit__(self, *_: object) -> None:
         if self._seq:
-            self._say("tray", None, state="ended")
+            self.all_ended()
         self._lines.put(None)
         self._thread.join(DRAIN_S)
 
     def begun(self) -> None:
-        self._say("tray", None, state="started")
+        self.started()
 
-    # Progress.
-
-    def stage(self, unit: str, stage: Stage) -> None:
-        self._latest.pop(unit, None)
-        self._say("stage", unit, stage=stage.value)
-
-    def note(self, unit: str, text: str) -> None:
-        """For people alone."""
-
-    def lost(self, unit: str, code: Code, reason: str) -> None:
-        self._say("lost", unit, code=code.value, reason=reason)
-
-    def back(self, unit: str) -> None:
-        self._say("back", unit)
-
-    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
-        following = guide.next
-        event = {
-            "found": guide.found,
-            "wanted": guide.wanted,
-            "next": None
-            if following is None
-            else {
-                "label": following.label,
-                "vector": [round(v, 6) for v in following.vector],
-                "once_more": following.once_more,
-            },
-        }
-        if self._latest.get(unit) != event:  # it comes several times a second
-            self._latest[unit] = event
-            self._say("poses", unit, **event)
-
-    def instruction(self, instruction: Instruction | None) -> None:
-        if instruction is not None:
-            self._say(
-                "instruction",
-                None,
-                label=instruction.label,
-                face=instruction.face,
-                vector=[round(v, 6) for v in instruction.vector],
-                slots=list(instruction.slots),
-            )
-
-    def ended(self, outcome: Outcome) -> None:
-        self._say("ended", outcome.unit, outcome=outcome.document)
-
-    def _say(self, event: str, unit: str | None, **more: Any) -> None:
+    def _following(self) -> int:
         self._seq += 1
-        line = {
-            "format": "triaxcal.event/1",
-            "seq": self._seq,
-            "time": self._now().isoformat(timespec="milliseconds"),
-            "run": None if unit is None else self._runs.get(unit),
-            "tray": self._tray,
-            "unit": unit,
-            "event": event,
-            **more,
-        }
-        self._lines.put(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)))
+        return self._seq
+
+    def _put(self, event: dict[str, Any]) -> None:
+        self._lines.put(printable_json(json.dumps(event, ensure_ascii=False, allow_nan=False)))
 
     def _work(self) -> None:
         while (line := self._lines.get()) is not None:

@@ -17,6 +17,9 @@ SAME_DEG = 10.0
 poses are to each other."""
 
 
+Vector = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class NextPose:
     """The pose to take next: the ``label`` in the plan and the direction of up in the
@@ -24,7 +27,7 @@ class NextPose:
     again."""
 
     label: str
-    vector: tuple[float, float, float]
+    vector: Vector
     once_more: bool = False
 
     def __str__(self) -> str:
@@ -48,7 +51,9 @@ class Guide:
     ``repeat_due``: the first pose is wanted once more, after all others. ``at`` is the
     label of the present pose in the plan, None during a motion and off the plan.
     ``counted_s`` are times inside the poses that were long enough, for the next
-    evaluation.
+    evaluation. ``taken`` are the directions of the distinct poses, ``lacking`` those of
+    the ``missing``, ``up`` that of the present pose, None during a motion; all in the
+    unit's axes.
     """
 
     found: int
@@ -63,6 +68,9 @@ class Guide:
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
     """Whether poses keep coming in unwanted directions, so that they must suffice."""
+    taken: tuple[Vector, ...] = ()
+    lacking: tuple[Vector, ...] = ()
+    up: Vector | None = None
 
     @property
     def complete(self) -> bool:
@@ -144,7 +152,17 @@ def guide(
         following = _pose_of(*next(target for target in targets if target[0] == missing[0]))
     too_short = 0 < still_s < hold_s and not enough[-1]
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
-    return Guide(found, wanted, still_s, hold_s, following, too_short, missing, due, at, middles, only_near)
+    return Guide(
+        found, wanted, still_s, hold_s, following, too_short, missing, due, at, middles, only_near,
+        taken=tuple(map(_vector, distinct)),
+        lacking=tuple(_vector(v) for label, v in targets if label in missing),
+        up=_vector(up[-1]) if still_s else None,
+    )  # fmt: skip
+
+
+def _vector(v: tc.Floats) -> Vector:
+    x, y, z = v.tolist()
+    return (x, y, z)
 
 
 def _near(v: tc.Floats, others: Sequence[tc.Floats], degrees: float) -> bool:
@@ -168,8 +186,7 @@ def _covered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats]
 
 
 def _pose_of(label: str, v: tc.Floats, *, once_more: bool = False) -> NextPose:
-    x, y, z = v.tolist()
-    return NextPose(label, (x, y, z), once_more)
+    return NextPose(label, _vector(v), once_more)
 
 
 def _again(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> NextPose:
