@@ -44,7 +44,11 @@ class Events:
         self._say("tray", None, state="ended")
 
     def ended(self, outcome: Outcome) -> None:
-        self._say("ended", outcome.unit, outcome=outcome.document)
+        self.settled(outcome.document)
+
+    def settled(self, outcome: Mapping[str, Any]) -> None:
+        """A run has ended with this `triaxcal.outcome/1`; a killed one too."""
+        self._say("ended", outcome["unit"], outcome=outcome)
 
     # Progress.
 

@@ -13,6 +13,14 @@ from triaxcald.store import History
 from triaxcald.work import Work
 
 
+class RuleBroken(InputError):
+    """A rule of the station forbids to begin; ``rule`` is its key."""
+
+    def __init__(self, rule: str, message: str) -> None:
+        super().__init__(message)
+        self.rule = rule
+
+
 def with_serials(station: Station, serials: Sequence[tuple[str, str]]) -> Station:
     """The station with other expected serial numbers: ``serials`` are pairs of slot and
     serial number. Raises InputError for an unknown slot, a slot or a serial number
@@ -39,11 +47,11 @@ def with_serials(station: Station, serials: Sequence[tuple[str, str]]) -> Statio
 
 def works(station: Station, given: Mapping[str, str | None]) -> dict[str, Work]:
     """The work of each slot: as ``given``, else as in the station file. Raises
-    InputError if a rule of the station forbids to begin."""
+    RuleBroken if a rule of the station forbids to begin."""
     rules = station.file.rules
     common = {**station.file.work.model_dump(), **{key: value for key, value in given.items() if value is not None}}
     if rules.operator and common.get("operator") is None:
-        raise InputError(f"{station.path}: rules.operator: give --operator NAME")
+        raise RuleBroken("operator", f"{station.path}: rules.operator: give --operator NAME")
     found = {}
     for place in station.places:
         work = Work(place.unit.name, place.unit.serial, **common)
@@ -55,20 +63,22 @@ def works(station: Station, given: Mapping[str, str | None]) -> dict[str, Work]:
 
 
 def require_serial(rules: Rules, serial: str, slot: str) -> None:
-    """Raises InputError if the serial number does not match the rule."""
+    """Raises RuleBroken if the serial number does not match the rule."""
     if rules.serial is not None and not re.fullmatch(rules.serial, serial):
-        raise InputError(f"unit {slot}: serial number {serial}: rules.serial expects {rules.serial}")
+        raise RuleBroken("serial", f"unit {slot}: serial number {serial}: rules.serial expects {rules.serial}")
 
 
 def require_allowed(rules: Rules, work: Work, serial: str, history: History) -> None:
-    """Raises InputError if the rules forbid another attempt at the serial number."""
+    """Raises RuleBroken if the rules forbid another attempt at the serial number."""
     if rules.attempts is not None and history.attempts >= rules.attempts:
-        raise InputError(
+        raise RuleBroken(
+            "attempts",
             f"unit {work.slot}: serial number {serial} has had {history.attempts} attempts, rules.attempts allows "
-            f"{rules.attempts}"
+            f"{rules.attempts}",
         )
     if rules.retest_reason and history.passed and work.reason is None:
-        raise InputError(
+        raise RuleBroken(
+            "retest_reason",
             f"unit {work.slot}: serial number {serial} has passed before, and rules.retest_reason asks for a reason; "
-            "give --reason TEXT"
+            "give --reason TEXT",
         )

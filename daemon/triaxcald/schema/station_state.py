@@ -9,6 +9,7 @@ from pydantic import Field
 
 import triaxcal as tc
 from triaxcald.schema.codes import Code, Stage
+from triaxcald.schema.event import NextPose
 from triaxcald.schema.outcome import WorkText
 
 
@@ -45,6 +46,7 @@ class SlotState(tc.schema.Model):
         tc.schema.Word[Code] | None, Field(description="reason for programs: of the end, or why the unit is lost")
     ]
     reason: Annotated[tc.schema.Text | None, Field(description="the same for people, one sentence")]
+    next: Annotated[NextPose | None, Field(description="the next pose of this unit; `null` if there is none")] = None
     since: Annotated[str, Field(description="time since which the slot is in this state, UTC")]
 
 

@@ -1,0 +1,408 @@
+"""The station at work: takes what people scan and order, runs the trays, and keeps the
+desk up to date."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from triaxcald.errors import DaemonError, InputError
+from triaxcald.run.attempts import Killed, settle_killed
+from triaxcald.run.events import Events
+from triaxcald.run.orders import RuleBroken, require_serial, with_serials, works
+from triaxcald.run.unit_run import Outcome, TrayRun
+from triaxcald.schema.codes import Code, Stage
+from triaxcald.service.desk import Desk, Scanned
+from triaxcald.service.errors import ApiError, Problem
+from triaxcald.service.stream import Stream
+from triaxcald.station.config import Station, check_lines
+from triaxcald.work import wrong
+
+if TYPE_CHECKING:
+    from triaxcald.recording.schema import Phase
+    from triaxcald.station.guidance import Guide
+    from triaxcald.station.tray import Instruction
+
+DISK_LEAST: Final = 64 << 20
+"""Free bytes below which no tray starts: more than the recordings of a tray of four."""
+LIVE_S: Final = 0.4
+"""Shortest time between two pictures of the directions."""
+DESK: Final = "desk"
+"""Key of what is kept of the desk."""
+
+
+class Book(Protocol):
+    """What the floor asks of the database. All methods block, and raise DaemonError."""
+
+    def take(self) -> list[str]: ...
+
+    def setting(self, key: str) -> Any | None: ...
+
+    def put_setting(self, key: str, value: Any) -> None: ...
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class Floor:
+    """``load`` reads the station file again. ``log`` takes a line for people,
+    ``recorded`` is called after runs have entered the database. All methods are called
+    in the event loop; those that take something from people raise ApiError."""
+
+    def __init__(
+        self,
+        station: Station,
+        book: Book,
+        stream: Callable[[Callable[[int], dict[str, Any]]], Stream],
+        *,
+        load: Callable[[], Station],
+        log: Callable[[str], None],
+        recorded: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.station, self._book, self._load, self._log, self._recorded = station, book, load, log, recorded
+        self.desk = _desk_of(station)
+        self.stream = stream(self.state)
+        self._tray: TrayRun | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._starting = asyncio.Lock()
+        self._entering = asyncio.Lock()
+        self._again = False
+        self._stopping = False
+        self._saved: dict[str, Any] | None = None
+        self.counts: dict[str, int] = {}
+        """Runs by verdict since the service began."""
+
+    async def begin(self) -> None:
+        """Settle what a killed service has left, and show the tray as it was. Raises
+        DaemonError."""
+        kept = await asyncio.to_thread(self._book.setting, DESK)
+        if isinstance(kept, Mapping):
+            self.desk.restore(kept, now())
+        for killed in await asyncio.to_thread(settle_killed, self.station):
+            self._settled(killed)
+        await self._enter()
+        self.stream.changed()
+        await self._save()
+
+    # What people order.
+
+    def state(self, seq: int) -> dict[str, Any]:
+        """The `triaxcal.station_state/1` after the event ``seq``."""
+        self.desk.blocked = self.blocked
+        return self.desk.document(seq)
+
+    @property
+    def blocked(self) -> str | None:
+        """Code of what keeps the next tray from starting."""
+        if self.stream.trouble is not None:
+            return Problem.DATABASE.value
+        with suppress(OSError):
+            if shutil.disk_usage(self.station.folder).free < DISK_LEAST:
+                return Problem.DISK.value
+        return None
+
+    async def scan(self, text: str) -> dict[str, Any]:
+        """Take a scanned text; gives what it was taken for."""
+        scanned = self.desk.scan(text, now())
+        answer = scanned.document()
+        if scanned.kind == "command":
+            return {**answer, **await self._command(scanned)}
+        if scanned.kind == "serial":
+            self._require_serial(scanned)
+        await self._changed()
+        return answer
+
+    async def _command(self, scanned: Scanned) -> dict[str, Any]:
+        if scanned.value == "START":
+            return await self.start(None)
+        if scanned.value == "STOP":
+            return await self.stop("stopped by the operator")
+        await self.clear()
+        return {}
+
+    def _require_serial(self, scanned: Scanned) -> None:
+        """Refuse a serial number against the rule at once, not only at the start."""
+        assert scanned.slot is not None
+        try:
+            require_serial(self.station.file.rules, scanned.value, scanned.slot)
+        except RuleBroken as e:
+            self.desk.slots[scanned.slot].empty(now())
+            raise ApiError(Problem.INVALID, str(e)) from e
+
+    async def put(self, serials: Mapping[str, str | None], work: Mapping[str, str | None]) -> None:
+        """Take serial numbers of slots, and work."""
+        self.desk.put(serials, work, now())
+        await self._changed()
+
+    async def clear(self) -> None:
+        self.desk.clear(now())
+        await self._changed()
+
+    async def start(self, request: str | None) -> dict[str, Any]:
+        """Start the scanned slots. The same ``request`` starts once, and gets the same
+        answer each time."""
+        async with self._starting:
+            if request is not None and request in self.desk.starts:
+                return self.desk.starts[request]
+            if self.desk.running or self._task is not None:
+                raise ApiError(Problem.RUNNING, "a tray is running")
+            if self._stopping:
+                raise ApiError(Problem.RUNNING, "the service is about to end")
+            due = self.desk.due()
+            if (blocked := self.blocked) is not None:
+                raise ApiError(Problem(blocked), _BLOCKED[Problem(blocked)])
+            tray = await self._made(due)
+            runs = {slot: unit.run for slot, unit in tray.units.items()}
+            answer = {"tray": tray.id, "runs": runs}
+            self.desk.started(tray.id, runs, due, now())
+            if request is not None:
+                self.desk.remember_start(request, answer)
+            # On the disk before any device is touched: a repetition after a restart of
+            # the service must not start again.
+            await self._changed()
+            self._tray = tray
+            self._task = asyncio.ensure_future(self._run(tray))
+            return answer
+
+    async def stop(self, reason: str) -> dict[str, Any]:
+        """Stop all units at work; gives their slots."""
+        return {"stopped": [slot for slot in self.desk.slots if self._stop(slot, reason)]}
+
+    async def stop_slot(self, slot: str, reason: str) -> dict[str, Any]:
+        if slot not in self.desk.slots:
+            raise ApiError(Problem.UNKNOWN, f"no slot '{slot}'; the slots are {', '.join(self.desk.slots)}")
+        return {"stopped": [slot] if self._stop(slot, reason) else []}
+
+    def _stop(self, slot: str, reason: str) -> bool:
+        if why := wrong(reason):
+            raise ApiError(Problem.INVALID, f"reason: {why}")
+        unit = None if self._tray is None else self._tray.units.get(slot)
+        if unit is None or unit.ended:
+            return False
+        unit.stop(reason)
+        return True
+
+    async def reload(self) -> None:
+        """Read the station file again, now or after the tray."""
+        self._again = True
+        if self._task is None:
+            await self._reloaded()
+
+    async def end(self) -> None:
+        """Stop what is at work, and wait until each device is in order. Each
+        cancellation meanwhile is passed on to the units."""
+        self._stopping = True
+        if self._task is not None:
+            for slot in self.desk.slots:
+                self._stop(slot, "the service was stopped")
+            while not self._task.done():
+                try:
+                    await asyncio.wait([self._task])
+                except asyncio.CancelledError:
+                    self._task.cancel()
+        await self._save()
+
+    # A tray.
+
+    async def _made(self, due: Mapping[str, str | None]) -> TrayRun:
+        """The units of these slots, ready to run."""
+        station = self.station
+        station = replace(station, places=tuple(p for p in station.places if p.unit.name in due))
+        given = {key: value for key, value in self.desk.work.items() if value is not None}
+        scanned = [(slot, serial) for slot, serial in due.items() if serial is not None]
+        try:
+            station = with_serials(station, scanned)
+            work = await asyncio.to_thread(works, station, given)
+            check_lines(station.places, where=str(station.path))
+        except RuleBroken as e:
+            problem = _OF_RULE.get(e.rule, Problem.INVALID)
+            raise ApiError(problem, _TOLD.get(e.rule, str(e))) from e
+        except InputError as e:
+            raise ApiError(Problem.INVALID, str(e)) from e
+        receiver = _Receiver(self._took, self.stream)
+        tray = TrayRun(
+            station, receiver, work=work, ended=receiver.ended, killed=self._settled, begun=receiver.begun
+        )  # fmt: skip
+        receiver.of(tray)
+        return tray
+
+    async def _run(self, tray: TrayRun) -> None:
+        try:
+            await tray
+        except asyncio.CancelledError:
+            raise
+        except DaemonError as e:
+            self._log(f"triaxcal: {e}")
+            self.desk.failed(str(e), now())
+        except Exception as e:  # noqa: BLE001 - supervises the tray: the service goes on
+            traceback.print_exc(file=sys.stderr)
+            self.desk.failed(f"internal error: {type(e).__name__}: {e}", now())
+        finally:
+            self._tray, self._task = None, None
+            for slot in self.desk.slots.values():
+                if slot.at_work:  # its outcome could not be made
+                    self.desk.failed("the run ended without an outcome", now())
+        await self._changed()
+        if self._again and not self._stopping:
+            await self._reloaded()
+
+    def _took(self, event: dict[str, Any]) -> None:
+        """Take an event of the tray."""
+        self.desk.apply(event)
+        self.stream.emit(event)
+        if event["event"] == "ended":
+            verdict = event["outcome"]["verdict"]
+            self.counts[verdict] = self.counts.get(verdict, 0) + 1
+            _keep_alive(asyncio.ensure_future(self._enter()))
+        if event["event"] in ("ended", "tray"):
+            _keep_alive(asyncio.ensure_future(self._save()))
+
+    def _settled(self, killed: Killed) -> None:
+        """A killed run has its outcome now."""
+        self._log(killed.line)
+        document = killed.document
+        events = Events(self.stream.emit, self.desk.tray or "", {document["unit"]: document["run"]},
+                        number=self.stream.number)  # fmt: skip
+        events.settled(document)
+        for slot in self.desk.slots.values():
+            if slot.run == document["run"]:
+                self.desk.ended(slot.slot, document, now())
+
+    async def _enter(self) -> None:
+        """Bring the database up to date with the folder."""
+        async with self._entering:
+            try:
+                await asyncio.to_thread(self._book.take)
+            except DaemonError as e:
+                self._log(f"triaxcal: {e}")
+                return
+        self._recorded()
+
+    async def _changed(self) -> None:
+        self.stream.changed()
+        await self._save()
+
+    async def _save(self) -> None:
+        """Keep the desk for a restart."""
+        kept = self.desk.kept()
+        if kept == self._saved:
+            return
+        try:
+            await asyncio.to_thread(self._book.put_setting, DESK, kept)
+            self._saved = kept
+        except DaemonError as e:
+            self._log(f"triaxcal: {e}")
+
+    async def _reloaded(self) -> None:
+        self._again = False
+        try:
+            station = await asyncio.to_thread(self._load)
+            station.require_units()
+        except (DaemonError, Exception) as e:  # noqa: BLE001 - the old station file stays in use
+            self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
+            return
+        kept = self.desk.kept()
+        self.station, self.desk = station, _desk_of(station)
+        self.desk.restore(kept, now())
+        self._log(f"{station.path}: loaded again")
+        await self._changed()
+
+
+def _desk_of(station: Station) -> Desk:
+    slots = [(place.unit.name, place.unit.serial) for place in station.places]
+    return Desk(station.file.name, slots, station.file.work.model_dump(), station.file.fixture.names, now())
+
+
+_OF_RULE: Final = {"attempts": Problem.ATTEMPTS_USED, "retest_reason": Problem.REASON_MISSING}
+_TOLD: Final = {
+    "operator": "no operator; scan the badge",
+    "retest_reason": "a unit of this tray has passed before; give the reason of the re-test",
+}
+_BLOCKED: Final = {
+    Problem.DISK: "the disk is full; free some space in the station's folder",
+    Problem.DATABASE: "the database does not take the events; see the log of the service",
+}
+_tasks: set[asyncio.Future[None]] = set()
+
+
+def _keep_alive(task: asyncio.Future[None]) -> None:
+    """The loop has only weak references to its tasks."""
+    _tasks.add(task)
+    task.add_done_callback(_tasks.discard)
+
+
+class _Receiver:
+    """The progress of a tray: as events, and as pictures of the directions."""
+
+    def __init__(self, took: Callable[[dict[str, Any]], None], stream: Stream) -> None:
+        self._took, self._stream = took, stream
+        self._events: Events | None = None
+        self._shown: dict[str, dict[str, Any]] = {}
+        self._shown_s = 0.0
+
+    def of(self, tray: TrayRun) -> None:
+        runs = {slot: unit.run for slot, unit in tray.units.items()}
+        self._events = Events(self._took, tray.id, runs, number=self._stream.number)
+        self._left = set(runs)
+
+    @property
+    def events(self) -> Events:
+        assert self._events is not None
+        return self._events
+
+    def begun(self) -> None:
+        self.events.started()
+
+    def ended(self, outcome: Outcome) -> None:
+        self._shown.pop(outcome.unit, None)
+        self.events.ended(outcome)
+        self._left.discard(outcome.unit)
+        if not self._left:
+            self.events.all_ended()
+
+    def stage(self, unit: str, stage: Stage) -> None:
+        self._shown.pop(unit, None)
+        self.events.stage(unit, stage)
+
+    def note(self, unit: str, text: str) -> None:
+        pass
+
+    def lost(self, unit: str, code: Code, reason: str) -> None:
+        self._shown.pop(unit, None)
+        self.events.lost(unit, code, reason)
+
+    def back(self, unit: str) -> None:
+        self.events.back(unit)
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        self.events.poses(unit, phase, guide)
+        self._shown[unit] = {
+            "up": _rounded(guide.up),
+            "held_s": round(guide.held_s, 1),
+            "hold_s": guide.hold_s,
+            "too_short": guide.too_short,
+            "taken": [_rounded(v) for v in guide.taken],
+            "missing": [_rounded(v) for v in guide.lacking],
+            "found": guide.found,
+            "wanted": guide.wanted,
+            "phase": phase,
+        }
+        at_s = asyncio.get_running_loop().time()
+        if at_s - self._shown_s >= LIVE_S:
+            self._shown_s = at_s
+            self._stream.live({"slots": dict(self._shown)})
+
+    def instruction(self, instruction: Instruction | None) -> None:
+        self.events.instruction(instruction)
+
+
+def _rounded(v: Sequence[float] | None) -> list[float] | None:
+    return None if v is None else [round(c, 3) for c in v]

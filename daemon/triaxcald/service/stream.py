@@ -1,0 +1,168 @@
+"""The events of the station for whoever listens: each is stored before it is sent, so
+that its number is never given twice, and sent to every listener in the same order."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from triaxcald.errors import DaemonError
+
+LISTENER_MOST: Final = 2_000
+"""Messages that wait for one listener. One that is slower than that is let go: it
+comes again with the number of the last event that it had."""
+TOGETHER_MOST: Final = 200
+"""Events that are stored in one transaction."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """``kind`` is `state`, `event` or `live`; ``seq`` is None of what has no number."""
+
+    kind: str
+    data: Mapping[str, Any]
+    seq: int | None = None
+
+
+class EventStore(Protocol):
+    """Where events are kept. All methods block, and raise DaemonError."""
+
+    def append(self, events: list[dict[str, Any]]) -> None: ...
+
+    def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]: ...
+
+    def last_seq(self) -> int: ...
+
+
+class TooSlow(Exception):
+    """The listener has not read for too long."""
+
+
+class _Listener:
+    def __init__(self) -> None:
+        self.messages: deque[Message] = deque()
+        self.news = asyncio.Event()
+        self.too_slow = False
+
+    def tell(self, message: Message) -> None:
+        if len(self.messages) >= LISTENER_MOST:
+            self.too_slow = True
+        else:
+            self.messages.append(message)
+        self.news.set()
+
+
+class Stream:
+    """``state`` gives the station state after the event of a number. All methods are
+    called in the event loop."""
+
+    def __init__(self, store: EventStore, state: Callable[[int], dict[str, Any]], kept: int = 10_000) -> None:
+        self._store, self._state, self._kept = store, state, kept
+        self._waiting: deque[Message] = deque()
+        self._news = asyncio.Event()
+        self._listeners: set[_Listener] = set()
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self.seq = 0
+        self.trouble: str | None = None
+        """Why the latest events are not stored."""
+
+    async def begin(self) -> None:
+        """Go on after the last stored event. Raises DaemonError."""
+        self.seq = await asyncio.to_thread(self._store.last_seq)
+
+    def number(self) -> int:
+        """The number of the next event."""
+        self.seq += 1
+        return self.seq
+
+    def emit(self, event: dict[str, Any]) -> None:
+        self._put(Message("event", event, int(event["seq"])))
+
+    def changed(self) -> None:
+        """The state has changed by something that is no event."""
+        self._put(Message("state", self._state(self.seq), self.seq))
+
+    def live(self, data: Mapping[str, Any]) -> None:
+        """Send values that nobody needs later."""
+        self._put(Message("live", data))
+
+    async def drained(self) -> None:
+        """Wait until everything is sent."""
+        await self._idle.wait()
+
+    def _put(self, message: Message) -> None:
+        self._waiting.append(message)
+        self._idle.clear()
+        self._news.set()
+
+    async def run(self) -> None:
+        """Store and send, until cancelled; what waits then is stored first."""
+        try:
+            while True:
+                await self._news.wait()
+                self._news.clear()
+                while self._waiting:
+                    await self._forward()
+                self._idle.set()
+        finally:
+            events = [dict(m.data) for m in self._waiting if m.kind == "event"]
+            if events:
+                with suppress(DaemonError):
+                    self._store.append(events)
+
+    async def _forward(self) -> None:
+        together = [self._waiting[i] for i in range(min(len(self._waiting), TOGETHER_MOST))]
+        events = [dict(m.data) for m in together if m.kind == "event"]
+        if events:
+            try:
+                await asyncio.to_thread(self._store.append, events)
+                self.trouble = None
+            except DaemonError as e:  # the work goes on, and is in the recordings
+                self.trouble = str(e)
+        for message in together:
+            self._waiting.popleft()
+            for listener in self._listeners:
+                listener.tell(message)
+
+    async def listen(self, after: int | None = None) -> AsyncGenerator[Message]:
+        """The present state; then the events behind ``after`` if they are kept, else
+        those to come. Raises TooSlow."""
+        listener = _Listener()
+        self._listeners.add(listener)
+        try:
+            # Listening begins here: what is not yet sent will come by itself.
+            seq = self.seq
+            sent = next((m.seq - 1 for m in self._waiting if m.kind == "event" and m.seq is not None), seq)
+            yield Message("state", self._state(seq), seq)
+            had = seq
+            if after is not None and 0 <= sent - after <= self._kept:
+                for event in await self._missed(after):
+                    if event["seq"] <= sent:
+                        yield Message("event", event, event["seq"])
+                had = sent
+            while True:
+                while listener.messages:
+                    message = listener.messages.popleft()
+                    if message.kind != "event" or message.seq is None or message.seq > had:
+                        yield message
+                if listener.too_slow:
+                    raise TooSlow
+                listener.news.clear()
+                await listener.news.wait()
+        finally:
+            self._listeners.discard(listener)
+
+    async def _missed(self, after: int) -> list[dict[str, Any]]:
+        try:
+            return await asyncio.to_thread(self._store.events_after, after, self._kept)
+        except DaemonError:
+            return []
+
+    @property
+    def listeners(self) -> int:
+        return len(self._listeners)
