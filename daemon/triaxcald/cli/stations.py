@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
     from triaxcald.demo import DemoUnit
     from triaxcald.run.unit_run import Outcome
     from triaxcald.schema.run import UnitOfDemo, UnitOfRun
-    from triaxcald.simulation.follow import Source
+    from triaxcald.simulation.follow import ServiceEvents, Source
     from triaxcald.simulation.tray import Tray
 
 
@@ -281,13 +281,12 @@ def _show_demo(u: DemoUnit) -> None:
 def sim_command(a: argparse.Namespace) -> int:
     from triaxcald.simulation.tray import load_tray
 
-    source = None
+    source: Source | ServiceEvents | None = None
     if a.follow is not None:
-        from triaxcald.simulation.follow import Source
+        from triaxcald.simulation.follow import ServiceEvents, Source
 
-        if a.follow.startswith(("http://", "https://")):
-            raise InputError(f"--follow {a.follow}: an address is not available yet, give a FILE or -")
-        source = Source(a.follow)
+        of_service = a.follow.startswith(("http://", "https://"))
+        source = ServiceEvents(a.follow) if of_service else Source(a.follow)
     tray = load_tray(a.devices, followed=source is not None)
     try:
         run_interruptible(_serve(tray, source))
@@ -298,7 +297,7 @@ def sim_command(a: argparse.Namespace) -> int:
     return 0
 
 
-async def _serve(tray: Tray, source: Source | None) -> None:
+async def _serve(tray: Tray, source: Source | ServiceEvents | None) -> None:
     from triaxcald.simulation.follow import follow
     from triaxcald.simulation.unit import keep_eeprom
     from triaxcald.station.simulators import Simulator, announced

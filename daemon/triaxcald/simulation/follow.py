@@ -10,7 +10,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from http.client import HTTPException
 from pathlib import Path
+from urllib.request import urlopen
 
 from triaxcald.errors import InputError
 from triaxcald.printable import printable
@@ -25,6 +27,10 @@ LOOK_S = 0.02
 """By the wall clock, from one look at a file to the next."""
 TICK_S = 0.1
 """Of the units' time: how exactly the operator keeps the reaction time of a switch."""
+EVENTS = "/api/1/events"
+DEAD_S, AGAIN_S = 10.0, 0.5
+"""A service that says nothing for so long is gone: it gives a sign of life every two
+seconds. Then the pause before the next connection."""
 TOLD_EACH = 10
 """Ignored lines that are told one by one; then at each power of ten."""
 
@@ -107,6 +113,45 @@ class Source:
                 os.lseek(self._descriptor, 0, os.SEEK_SET)
 
 
+class ServiceEvents:
+    """The events of a station's service at ``address``, to which it connects again and
+    again; as lines, like a `Source`. ``address`` is that of the service or of its
+    `/events`."""
+
+    def __init__(self, address: str) -> None:
+        self.name = address
+        self._address = address if address.rstrip("/").endswith("/events") else f"{address.rstrip('/')}{EVENTS}"
+        self._after: str | None = None
+
+    def read(self, tell: Callable[[bytes | None], None]) -> None:
+        """Tell each event as a line, for ever. Blocks."""
+        while True:
+            with suppress(OSError, ValueError, HTTPException):
+                self._listen(tell)
+            time.sleep(AGAIN_S)
+
+    def _listen(self, tell: Callable[[bytes | None], None]) -> None:
+        """Raises OSError, HTTPException at the end of the connection; ValueError of an
+        answer that is none."""
+        query = "" if self._after is None else f"?after={self._after}"
+        with urlopen(self._address + query, timeout=DEAD_S) as answer:
+            kind, number = b"", b""
+            for line in iter(lambda: answer.readline(LINE_MOST), b""):
+                field, _, value = line.rstrip(b"\r\n").partition(b":")
+                value = value.removeprefix(b" ")
+                if field == b"event":
+                    kind = value
+                elif field == b"id":
+                    number = value
+                elif field == b"data" and kind == b"state" and self._after is None:
+                    self._after = str(int(number))
+                elif field == b"data" and kind == b"event":
+                    tell(value + b"\n")
+                    self._after = str(int(number))
+                elif not field:
+                    kind = b""
+
+
 def _opened(path: Path) -> int:
     """A FIFO without a writer opens too."""
     nonblocking = getattr(os, "O_NONBLOCK", 0)
@@ -117,7 +162,7 @@ def _opened(path: Path) -> int:
 
 
 async def follow(
-    source: Source,
+    source: Source | ServiceEvents,
     operator: Operator,
     units: Mapping[str, ReferenceUnit],
     time_base: TimeBase,
