@@ -31,7 +31,7 @@ from tests.end_to_end.conftest import PROGRAM, until
 from triaxcald.provision.state import DeviceState
 from triaxcald.recording import disk
 from triaxcald.recording.reader import Recording
-from triaxcald.run import provisioning, unit_run
+from triaxcald.run import provision_by_hand, unit_run
 from triaxcald.run.orders import works
 from triaxcald.run.unit_run import UnitHandle, run_station
 from triaxcald.schema.codes import Code, Stage
@@ -327,7 +327,7 @@ class Factory:
 
         with line.virtual_line(), self._patch.context() as patch:
             patch.setattr(Place, "device", lambda place: self._device(place))
-            patch.setattr(provisioning, "RegisterLink", line._linked)
+            patch.setattr(provision_by_hand, "RegisterLink", line._linked)
             patch.setattr(unit_run, "certify", failing)
             patch.setattr(disk, "require_room", full)
             yield

@@ -46,7 +46,7 @@ def run_command(a: argparse.Namespace) -> int:
     work = works(station, given)
     rezero = {}
     if a.rezero:
-        from triaxcald.earlier import earlier_by_unit
+        from triaxcald.earlier_calibration import earlier_by_unit
 
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
