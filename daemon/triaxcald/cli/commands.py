@@ -1,4 +1,5 @@
-"""Runs one command; the one place where errors become exit codes."""
+"""Runs one command of the line: finds its module, and calls it so that errors become
+exit codes (`triaxcald.cli.exit_codes`)."""
 
 from __future__ import annotations
 
