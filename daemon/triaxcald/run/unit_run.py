@@ -677,21 +677,6 @@ class TrayRun:
         return outcome
 
 
-def run_station(
-    station: Station,
-    progress: Progress,
-    *,
-    force: str | None = None,
-    rezero: Mapping[str, EarlierFile] | None = None,
-    work: Mapping[str, Work] | None = None,
-    ended: Callable[[Outcome], None] = lambda _: None,
-    killed: Callable[[Killed], None] = lambda _: None,
-    begun: Callable[[], None] = lambda: None,
-) -> TrayRun:
-    """The units of a station, to be awaited; arguments as in `TrayRun`."""
-    return TrayRun(station, progress, force=force, rezero=rezero, work=work, ended=ended, killed=killed, begun=begun)
-
-
 def _attempts_at(station: Station, tray: str) -> Attempts:
     return Attempts(station.folder, tray, station.file.name, station.file.limits.model_dump())
 
