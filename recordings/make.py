@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from triaxcald.cli.bars import Bars
-from triaxcald.run.unit_run import run_station
+from triaxcald.run.unit_run import TrayRun
 from triaxcald.simulation.bench import DeviceFile, SyntheticPhysics, physics_of, simulate
 from triaxcald.station.config import load_station
 
@@ -83,7 +83,7 @@ async def make(name: str) -> None:
             inline = "{ " + ", ".join(f"{k} = {json.dumps(v)}" for k, v in bus.items()) + " }"
             path = Path(folder) / "station.toml"
             path.write_text(STATION.format(name=name, profile=device.profile, bus=inline))
-            (outcome,) = await run_station(load_station(path), bars)
+            (outcome,) = await TrayRun(load_station(path), bars)
         if outcome.exit_code or outcome.recording is None:
             sys.exit(f"{name}: exit code {outcome.exit_code}: {outcome.error}")
         shutil.copy(outcome.recording, HERE / f"{name}.mcap")

@@ -41,7 +41,7 @@ def test_the_service_starts_a_command_that_there_is(unit: configparser.ConfigPar
 def test_a_recorder_loads_nothing_that_draws() -> None:
     """Under the service's sandbox matplotlib finds no folder to write to, and it takes memory for months."""
     code = (
-        "import sys, triaxcald.cli.record, triaxcald.run.recording, triaxcald.run.session\n"
+        "import sys, triaxcald.cli.record, triaxcald.run.record_only, triaxcald.run.session\n"
         "import triaxcald.service.supervisor\n"
         "sys.exit('matplotlib' in sys.modules)"
     )

@@ -351,7 +351,7 @@ def test_the_driver_of_the_examples_is_found_and_decodes(tmp_path: Path) -> None
     code = """
 from pathlib import Path
 from triaxcal_drivers.interface import RawBatch
-from triaxcald.pipeline import Pipeline
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.schema.run import Run
 from triaxcald.station.config import load_station
 (place,) = load_station(Path("station.toml")).places

@@ -21,8 +21,8 @@ import triaxcal_drivers as td
 from triaxcald.caveats import is_passing
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
-from triaxcald.pipeline import Pipeline, of_poses
 from triaxcald.provision.registers import RegisterImage, build_image
+from triaxcald.raw_to_poses import Pipeline, of_poses
 from triaxcald.recording.schema import RawDigest
 from triaxcald.software import drawn_with as drawn_with
 from triaxcald.software import software as software

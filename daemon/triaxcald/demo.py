@@ -16,7 +16,7 @@ import triaxcal as tc
 from triaxcald.errors import INTERRUPTED, InputError
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
-from triaxcald.run.unit_run import Outcome, UnitRun, run_station
+from triaxcald.run.unit_run import Outcome, TrayRun, UnitRun
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
@@ -85,7 +85,7 @@ async def run_demo(folder: Path, seed: int, progress: Progress, ended: Callable[
         servers = [await first.enter_async_context(unit.serve()) for unit in units]
         path = folder / "station.toml"
         write_text(path, _station(devices, channel, servers[1].bus.port))
-        outcomes = await run_station(load_station(path), progress, ended=ended)
+        outcomes = await TrayRun(load_station(path), progress, ended=ended)
         if any(outcome.exit_code == INTERRUPTED for outcome in outcomes):
             return [DemoUnit(u.truth, o, None, False, False) for u, o in zip(units, outcomes, strict=True)]
     # The plug is pulled on both: what follows knows nothing but their EEPROMs.

@@ -17,8 +17,8 @@ from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.documents import TooManyContainers, json_value
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import Pipeline, of_poses, together
 from triaxcald.provision.identity import same_serial
+from triaxcald.raw_to_poses import Pipeline, of_poses, together
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.reader import Contents, is_recording, open_recording
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION

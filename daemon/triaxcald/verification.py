@@ -15,7 +15,7 @@ import numpy as np
 
 import triaxcal as tc
 from triaxcald.computer import compute_with_one_thread
-from triaxcald.pipeline import Pipeline, of_poses
+from triaxcald.raw_to_poses import Pipeline, of_poses
 from triaxcald.station.guidance import ups
 
 WITHIN: Final = "within limits"

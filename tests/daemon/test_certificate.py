@@ -18,7 +18,7 @@ from triaxcal_drivers.profile import Bundle
 from triaxcald.certificate import Certified, certify, held_by_device, roles
 from triaxcald.documents import to_text
 from triaxcald.inputs import CALIBRATION
-from triaxcald.pipeline import Pipeline
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RawDigest
 from triaxcald.station.config import parse_station

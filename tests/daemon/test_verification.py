@@ -10,7 +10,7 @@ import pytest
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.catalogue import load_bundle
 from triaxcal_drivers.profile import CORRECTED
-from triaxcald.pipeline import Pipeline
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.verification import Apart, verification_document, verified, verify
 
 RAW = "0" * 64

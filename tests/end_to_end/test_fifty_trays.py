@@ -31,9 +31,9 @@ from tests.end_to_end.conftest import PROGRAM, until
 from triaxcald.provision.state import DeviceState
 from triaxcald.recording import disk
 from triaxcald.recording.reader import Recording
-from triaxcald.run import provisioning, unit_run
+from triaxcald.run import provision_by_hand, unit_run
 from triaxcald.run.orders import works
-from triaxcald.run.unit_run import UnitHandle, run_station
+from triaxcald.run.unit_run import TrayRun, UnitHandle
 from triaxcald.schema.codes import Code, Stage
 from triaxcald.simulation.unit import (
     CRC,
@@ -327,7 +327,7 @@ class Factory:
 
         with line.virtual_line(), self._patch.context() as patch:
             patch.setattr(Place, "device", lambda place: self._device(place))
-            patch.setattr(provisioning, "RegisterLink", line._linked)
+            patch.setattr(provision_by_hand, "RegisterLink", line._linked)
             patch.setattr(unit_run, "certify", failing)
             patch.setattr(disk, "require_room", full)
             yield
@@ -373,7 +373,7 @@ class Factory:
                 for place in station.places:
                     if slots[place.unit.name].fault == "in use":
                         await stack.enter_async_context(locked(td.claim_of(place.bus)))
-                tray = run_station(
+                tray = TrayRun(
                     station, watcher, work=works(station, given), ended=lambda o: self.ended.append(dict(o.document))
                 )
                 watcher.units = tray.units

@@ -15,7 +15,7 @@ import pytest
 from triaxcal_drivers.modbus.protocol import READ_INPUT
 from triaxcald.errors import RecordingError
 from triaxcald.inputs import CALIBRATION, bundle_of
-from triaxcald.pipeline import Pipeline
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.simulation.unit import Stored, factory_calibration
 from triaxcald.text import VERDICTS

@@ -13,7 +13,7 @@ from tests.conftest import Workshop
 from triaxcal_drivers.modbus.line import serve_serial
 from triaxcal_drivers.modbus.protocol import SerialLine
 from triaxcald.audit import audit
-from triaxcald.run.unit_run import Outcome, run_station
+from triaxcald.run.unit_run import Outcome, TrayRun
 from triaxcald.schema.codes import Stage
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.modbus_unit import ModbusMap, pty_pair
@@ -106,7 +106,7 @@ async def run_all(workshop: Workshop, bench: Bench, told: Told, ended: list[str]
         station = load_station(workshop.station(*units, plan=PLAN, provisioning={"write": False}))
         check_lines(station.places, where="station.toml")
         trouble = asyncio.ensure_future(bench.trouble(told))
-        outcomes = await run_station(station, told, ended=lambda outcome: ended.append(outcome.unit))
+        outcomes = await TrayRun(station, told, ended=lambda outcome: ended.append(outcome.unit))
         trouble.cancel()
     return outcomes
 

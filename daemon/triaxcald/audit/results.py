@@ -14,8 +14,8 @@ from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.decoded import DecodedStream
-from triaxcald.earlier import ATTACHMENT as EARLIER
-from triaxcald.earlier import RECORD, EarlierFile
+from triaxcald.earlier_calibration import ATTACHMENT as EARLIER
+from triaxcald.earlier_calibration import RECORD, EarlierFile
 from triaxcald.errors import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED, DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import (
@@ -29,9 +29,9 @@ from triaxcald.outcome import (
     measured_in,
     outcome_document,
 )
-from triaxcald.pipeline import Pipeline
 from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report

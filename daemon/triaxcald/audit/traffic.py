@@ -10,7 +10,7 @@ from functools import cached_property
 
 import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
-from triaxcald.audit.marks import Mark, Marks, marks_in
+from triaxcald.audit.restart_probes import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
 from triaxcald.provision.access import Label

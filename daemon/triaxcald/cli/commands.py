@@ -1,4 +1,5 @@
-"""Runs one command; the one place where errors become exit codes."""
+"""Runs one command of the line: finds its module, and calls it so that errors become
+exit codes (`triaxcald.cli.exit_codes`)."""
 
 from __future__ import annotations
 
@@ -56,11 +57,11 @@ def main(arguments: Sequence[str]) -> int:
     except SystemExit as e:
         return int(e.code or 0)
     except OSError as e:  # what was asked for is the version, and standard output does not take it
-        from triaxcald.cli.running import not_written
+        from triaxcald.cli.exit_codes import not_written
 
         return not_written(e, 0)
     require_address_space()
-    from triaxcald.cli.running import run  # what an error may be of, and what shows it
+    from triaxcald.cli.exit_codes import run  # what an error may be of, and what shows it
 
     return run(lambda: keep_apart(chosen), _working(chosen))
 

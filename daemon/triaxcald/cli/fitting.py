@@ -16,7 +16,7 @@ import triaxcal as tc
 from triaxcald import documents
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import emit, micro, progress, show, table
-from triaxcald.cli.results import (
+from triaxcald.cli.show_fit import (
     WORTH_A_LINE,
     chance_of,
     cross_validated,
@@ -32,7 +32,7 @@ from triaxcald.cli.results import (
 from triaxcald.cli.showing import FitSettings, fit_settings, judge, read_recording, telling_data_quality, warn
 from triaxcald.cli.syntax import writable
 from triaxcald.documents import rezero_document
-from triaxcald.earlier import EarlierFile
+from triaxcald.earlier_calibration import EarlierFile
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, read_document, require_unit

@@ -1,5 +1,4 @@
-"""The command line ``triaxcal``: which commands there are, and what exit code
-each failure owes."""
+"""Start and end of the process of the command line ``triaxcal``."""
 
 from __future__ import annotations
 

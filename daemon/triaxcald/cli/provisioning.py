@@ -20,7 +20,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage
 from triaxcald.run.attempts import settle_killed
-from triaxcald.run.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
+from triaxcald.run.provision_by_hand import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.schema.codes import Stage
 from triaxcald.station.config import Place, Station, days_since_1970, load_station
 

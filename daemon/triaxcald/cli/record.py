@@ -37,7 +37,7 @@ from triaxcald.station.guidance import Guide
 from triaxcald.station.tray import Instruction
 
 if TYPE_CHECKING:
-    from triaxcald.run.recording import AtRecording, Kept, Roster
+    from triaxcald.run.record_only import AtRecording, Kept, Roster
     from triaxcald.run.session import Segments, UnitSession
     from triaxcald.station.config import SerialsSeen
 
@@ -157,7 +157,7 @@ def _load(a: argparse.Namespace) -> _Chosen:
 async def _record(
     a: argparse.Namespace, chosen: _Chosen, progress: Bars | JsonLines, hangup: asyncio.Event
 ) -> list[Kept]:
-    from triaxcald.run.recording import Roster, State
+    from triaxcald.run.record_only import Roster, State
     from triaxcald.service.supervisor import Supervisor
     from triaxcald.station.config import SerialsSeen
     from triaxcald.station.reconnect import RetryPolicy
@@ -198,7 +198,7 @@ async def _reload(
     """The station file, each time that it is asked for. What is as it was goes
     on; what ended, for whatever reason, begins again. What the disk ended does
     so now and then by itself."""
-    from triaxcald.run.reasons import reason_of, trace_of
+    from triaxcald.run.error_reasons import reason_of, trace_of
 
     while True:
         asked = await _is_set(hangup, AGAIN_S)
@@ -266,7 +266,7 @@ def _of_units(
     progress: Bars | JsonLines,
     serials: SerialsSeen,
 ) -> list[AtRecording]:
-    from triaxcald.run.recording import UnitRecording
+    from triaxcald.run.record_only import UnitRecording
     from triaxcald.run.session import UnitSession
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
@@ -290,7 +290,7 @@ def _of_units(
 def _of_buses(
     a: argparse.Namespace, station: Station, buses: Sequence[BusPlace], progress: Bars | JsonLines
 ) -> list[AtRecording]:
-    from triaxcald.run.recording import BusRecording, bus_recording_name
+    from triaxcald.run.record_only import BusRecording, bus_recording_name
 
     def path_of(bus: BusPlace) -> Path:
         if not a.folder:

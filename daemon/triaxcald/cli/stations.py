@@ -46,11 +46,11 @@ def run_command(a: argparse.Namespace) -> int:
     work = works(station, given)
     rezero = {}
     if a.rezero:
-        from triaxcald.earlier import earlier_by_unit
+        from triaxcald.earlier_calibration import earlier_by_unit
 
         rezero = earlier_by_unit(a.rezero, station)
     check_lines(station.places, where=str(station.path))
-    from triaxcald.run.unit_run import run_station
+    from triaxcald.run.unit_run import TrayRun
     from triaxcald.schema.run import Run
 
     with ExitStack() as stack:
@@ -66,7 +66,7 @@ def run_command(a: argparse.Namespace) -> int:
             for events in receivers[1:]:
                 events.begun()
 
-        tray = run_station(
+        tray = TrayRun(
             station, Several(receivers), force=a.force, rezero=rezero, work=work,
             ended=ended, killed=lambda killed: say(killed.line), begun=begun,
         )  # fmt: skip

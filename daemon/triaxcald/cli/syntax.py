@@ -369,7 +369,7 @@ def _line(commands: Any) -> None:
     )
     p.add_argument("--log-format", choices=("text", "json"), default="text", help="of progress; json: an object a line")
     p = _command(
-        commands, "results", "runs:results_command", "one row for each run in a station's folder",
+        commands, "results", "results:results_command", "one row for each run in a station's folder",
         "Shows the runs, or writes them with all their columns to a table.",
         "results out --since 2026-01-01 -o runs.csv",
     )  # fmt: skip

@@ -17,8 +17,8 @@ from triaxcald import text
 from triaxcald.caveats import assumption
 from triaxcald.certificate import Certified
 from triaxcald.outcome import Ending
-from triaxcald.pipeline import Pipeline
 from triaxcald.provision.state import Held
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.report import figures
 from triaxcald.report.charts import (
     StreamOverview,

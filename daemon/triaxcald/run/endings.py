@@ -21,9 +21,9 @@ from triaxcald.printable import printable_lines
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import ReadingsNotStated
 from triaxcald.provision.state import DeviceState
-from triaxcald.run.reasons import code_of as code_of
-from triaxcald.run.reasons import reason_of as reason_of
-from triaxcald.run.reasons import trace_of as trace_of
+from triaxcald.run.error_reasons import code_of as code_of
+from triaxcald.run.error_reasons import reason_of as reason_of
+from triaxcald.run.error_reasons import trace_of as trace_of
 from triaxcald.station.config import Limits
 from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
 from triaxcald.verification import WORSE

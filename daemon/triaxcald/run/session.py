@@ -19,7 +19,7 @@ from triaxcald.provision.registers import Snapshot, take_snapshot
 from triaxcald.recording.manifest import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.reasons import code_of
+from triaxcald.run.error_reasons import code_of
 from triaxcald.schema.codes import Code, Stage
 from triaxcald.software import drawn_with, software, versions
 from triaxcald.station.collection import Progress, Recorded

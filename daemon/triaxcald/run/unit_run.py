@@ -19,8 +19,8 @@ from triaxcald import text
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.certificate import Certified, certify, why_not_written
 from triaxcald.documents import to_text
-from triaxcald.earlier import ATTACHMENT as EARLIER
-from triaxcald.earlier import RECORD, EarlierFile
+from triaxcald.earlier_calibration import ATTACHMENT as EARLIER
+from triaxcald.earlier_calibration import RECORD, EarlierFile
 from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
 from triaxcald.files import unused, write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
@@ -40,12 +40,12 @@ from triaxcald.outcome import (
     outcome_document,
     registers_told,
 )
-from triaxcald.pipeline import Pipeline
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.journal import Owner, journals_of, open_journal
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
@@ -675,21 +675,6 @@ class TrayRun:
                 self._shown.ended(run.name)
         self._ended(outcome)
         return outcome
-
-
-def run_station(
-    station: Station,
-    progress: Progress,
-    *,
-    force: str | None = None,
-    rezero: Mapping[str, EarlierFile] | None = None,
-    work: Mapping[str, Work] | None = None,
-    ended: Callable[[Outcome], None] = lambda _: None,
-    killed: Callable[[Killed], None] = lambda _: None,
-    begun: Callable[[], None] = lambda: None,
-) -> TrayRun:
-    """The units of a station, to be awaited; arguments as in `TrayRun`."""
-    return TrayRun(station, progress, force=force, rezero=rezero, work=work, ended=ended, killed=killed, begun=begun)
 
 
 def _attempts_at(station: Station, tray: str) -> Attempts:

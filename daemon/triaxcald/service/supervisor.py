@@ -25,7 +25,7 @@ from prometheus_client.registry import Collector
 
 import triaxcal_drivers as td
 from triaxcald.errors import InputError, StationError
-from triaxcald.run.recording import State, UnitStatus
+from triaxcald.run.record_only import State, UnitStatus
 
 _SHARE = 3.0
 """Signs of life per watchdog time, so that one may be late."""

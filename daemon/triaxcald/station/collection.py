@@ -219,7 +219,7 @@ class Collection(Recorded):
     """`Recorded` with a search for poses, which guides the operator at once."""
 
     def __post_init__(self) -> None:
-        from triaxcald.pipeline import Pipeline  # a mere recording needs no metrology
+        from triaxcald.raw_to_poses import Pipeline  # a mere recording needs no metrology
 
         self.pipelines = {s: Pipeline(self.bundle, s) for s in self._names()}
         super().__post_init__()

@@ -16,7 +16,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.fitting import COLUMNS
-from triaxcald.cli.results import cross_validated
+from triaxcald.cli.show_fit import cross_validated
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.interface import RawBatch
+from triaxcald.cli.exit_codes import run
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.cli.running import run
 from triaxcald.errors import DiskError, RecordingError, exit_code_of
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording.writer import RecordingFile, RecordingWriter
 from triaxcald.run.endings import aborted
-from triaxcald.run.reasons import reason_of, trace_of
+from triaxcald.run.error_reasons import reason_of, trace_of
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
 TOO_MUCH = 2**60
@@ -114,7 +114,7 @@ def test_a_recording_whose_writer_has_no_memory_is_sound_up_to_a_time(
 
 FULL = """
 import mmap, resource, sys
-from triaxcald.cli.running import run
+from triaxcald.cli.exit_codes import run
 
 def work():
     if {limited}:

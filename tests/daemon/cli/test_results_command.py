@@ -151,7 +151,7 @@ def test_the_console_has_a_row_a_run_and_a_summary(folder: Path, triaxcal: Run) 
 def test_of_very_many_runs_the_console_has_the_last(
     folder: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("triaxcald.cli.runs.SHOWN_MOST", 1)
+    monkeypatch.setattr("triaxcald.cli.results.SHOWN_MOST", 1)
     out = triaxcal("results", folder).out
     assert "the last 1 of 2 runs" in out
     assert ("2026-01-31" in out, "2025-12-31" in out) == (True, False)

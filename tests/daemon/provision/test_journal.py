@@ -17,7 +17,7 @@ from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.errors import DiskError, InputError
 from triaxcald.provision.journal import Entry, Journal, Owner, journals_of, open_journal, parse
-from triaxcald.run.provisioning import unit_in
+from triaxcald.run.provision_by_hand import unit_in
 from triaxcald.software import new_run_id
 
 LEFT = Owner("TRIAX/REF", "0007", "left")

@@ -24,8 +24,8 @@ from triaxcald.recording import writer as writer_module
 from triaxcald.recording.bus import frame_rows
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import BUS_RECORD
-from triaxcald.run import recording as recording_module
-from triaxcald.run.recording import BusRecording, State
+from triaxcald.run import record_only
+from triaxcald.run.record_only import BusRecording, State
 from triaxcald.station.config import Station, load_station
 from triaxcald.station.reconnect import RetryPolicy
 
@@ -249,7 +249,7 @@ async def test_a_folder_that_is_removed_ends_the_recording_of_a_bus_that_brings_
     workshop: Any, port: Path, lost: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "LOOK_S", 0.01)
-    monkeypatch.setattr(recording_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(record_only, "LOOK_S", 0.01)
     bus = {"interface": "slcan", "channel": str(port)}
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
     told, folder, dongle = Told(), workshop.folder / "recordings", Dongle(port)

@@ -24,7 +24,7 @@ from triaxcald.audit import audit
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
-from triaxcald.run.unit_run import run_station
+from triaxcald.run.unit_run import TrayRun
 from triaxcald.schema.codes import Stage
 from triaxcald.station import output_check as confirmation
 from triaxcald.station.config import load_station
@@ -266,7 +266,7 @@ async def test_the_run_of_a_unit_that_was_exchanged_is_aborted_and_the_others_go
         station = load_station(workshop.station(*places, plan=plan))
         ours = served[0].unit.eeprom
         told = Changing("unit0", MOMENTS[moment], lambda: setattr(served[0].unit, "serial_number", 999))
-        outcome, other = await run_station(station, told)
+        outcome, other = await TrayRun(station, told)
     assert other.error is None
     assert (outcome.exit_code, outcome.document["verdict"]) == (4, "aborted")
     assert "0999" in str(outcome.error)

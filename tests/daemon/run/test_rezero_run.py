@@ -19,7 +19,7 @@ from triaxcal.model.directions import bias_directions
 from triaxcald.audit import audit
 from triaxcald.audit.conduct import Result
 from triaxcald.cli.commands import main
-from triaxcald.earlier import ATTACHMENT
+from triaxcald.earlier_calibration import ATTACHMENT
 from triaxcald.recording.reader import Recording
 from triaxcald.station.guidance import guide
 

@@ -11,7 +11,7 @@ import pytest
 
 from triaxcald.errors import DISK, INTERRUPTED, DiskError, RecordingError
 from triaxcald.recording.schema import Phase
-from triaxcald.run.recording import AtRecording, Kept, Roster, State
+from triaxcald.run.record_only import AtRecording, Kept, Roster, State
 from triaxcald.schema.codes import Stage
 from triaxcald.station.guidance import Guide
 from triaxcald.station.listening import RawRecords
@@ -180,7 +180,7 @@ async def test_what_was_wrong_with_the_manifest_is_shown(tmp_path: Path) -> None
 async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("triaxcald.run.recording.LOOK_S", 0.001)
+    monkeypatch.setattr("triaxcald.run.record_only.LOOK_S", 0.001)
     one = Written("a")
     one.writer = Writer(tmp_path / "a-000002.mcap")
     work = asyncio.ensure_future(one.run(None, RetryPolicy()))

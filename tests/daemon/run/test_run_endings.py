@@ -19,7 +19,7 @@ from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run import unit_run
-from triaxcald.run.unit_run import Outcome, UnitRun, run_station
+from triaxcald.run.unit_run import Outcome, TrayRun, UnitRun
 from triaxcald.schema.codes import Stage
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.unit import CALIBRATION, Stored, factory_calibration
@@ -58,7 +58,7 @@ def _holds_old(served: Any) -> None:
 async def _outcome(workshop: Any, served: Any, **settings: Any) -> Outcome:
     unit = {"bus": served.bus, "profile": settings.pop("profile", "triax-ref-modbus")}
     station = workshop.station(unit, **{"plan": PLAN, **settings})
-    (outcome,) = await run_station(load_station(station), Quiet())
+    (outcome,) = await TrayRun(load_station(station), Quiet())
     return outcome
 
 
@@ -103,7 +103,7 @@ async def test_an_internal_error_is_an_outcome_even_where_nobody_can_be_told(
     with workshop.serve(workshop.device(**QUICK)) as served:
         station = load_station(workshop.station({"bus": served.bus}))
         monkeypatch.setattr(sys, "stderr", _Closed())
-        (outcome,) = await run_station(station, Quiet())
+        (outcome,) = await TrayRun(station, Quiet())
     assert outcome.exit_code == 4
     assert outcome.error == "unit unit0: internal error: ValueError('a fault of the program')"
     assert outcome.device_state is None

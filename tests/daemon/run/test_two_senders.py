@@ -11,7 +11,7 @@ import pytest
 from triaxcal_drivers.profile import READINGS
 from triaxcald.audit import audit
 from triaxcald.inputs import CALIBRATION, bundle_of
-from triaxcald.pipeline import Pipeline
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 
 Run = Callable[..., Any]

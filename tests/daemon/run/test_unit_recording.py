@@ -17,7 +17,7 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import Kept, Roster, State, UnitRecording
+from triaxcald.run.record_only import Kept, Roster, State, UnitRecording
 from triaxcald.run.session import UnitSession
 from triaxcald.schema.codes import Stage
 from triaxcald.simulation.bench import load_device, simulate

@@ -17,7 +17,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from triaxcald.errors import InputError, StationError
-from triaxcald.run.recording import State, UnitStatus
+from triaxcald.run.record_only import State, UnitStatus
 from triaxcald.service.supervisor import served
 
 COUNTS = {"samples": 1000, "missing": 7, "errors": 2, "malformed": 4}

@@ -14,7 +14,7 @@ from tests.guest.inside.witness import wait_until
 from triaxcald.cli.commands import main
 from triaxcald.cli.signals import heed_stop_signals
 from triaxcald.recording.reader import Recording
-from triaxcald.run import recording  # noqa: F401 - these take long, and so are imported once for all processes
+from triaxcald.run import record_only  # noqa: F401 - these take long, and so are imported once for all processes
 from triaxcald.simulation import bench, can_unit  # noqa: F401
 from triaxcald.station.lock import FOLDER_VARIABLE
 

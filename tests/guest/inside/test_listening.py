@@ -16,7 +16,7 @@ from tests.guest.inside.test_reconnect import Told, until
 from tests.guest.inside.witness import ERROR, EXTENDED, REMOTE, Seen, Sender, listeners, words_of
 from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.interface import RawFlag
-from triaxcald.run.recording import BusRecording, State, UnitRecording
+from triaxcald.run.record_only import BusRecording, State, UnitRecording
 from triaxcald.run.session import UnitSession
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE

@@ -26,7 +26,7 @@ from triaxcald.provision.journal import Entry, Journal
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.run.attempts import FOLDER, Attempts, settle_killed
-from triaxcald.run.unit_run import Outcome, run_station
+from triaxcald.run.unit_run import Outcome, TrayRun
 from triaxcald.schema.codes import Stage
 from triaxcald.schema.event import Event
 from triaxcald.station.config import load_station
@@ -131,7 +131,7 @@ def test_one_unit_is_stopped_with_a_reason_while_the_other_goes_on(bench: Path) 
             if unit == "left" and found == 3:
                 tray.units["left"].stop("wrong label")
 
-        tray = run_station(load_station(bench), Quiet(at), ended=lambda o: ended.append(o.unit))
+        tray = TrayRun(load_station(bench), Quiet(at), ended=lambda o: ended.append(o.unit))
         outcomes = await tray
         assert all(handle.ended for handle in tray.units.values())
         return outcomes
@@ -200,7 +200,7 @@ def test_a_reader_that_does_not_read_holds_up_no_event() -> None:
 @pytest.mark.slow
 def test_a_unit_that_is_stopped_before_the_start_gets_its_outcome(bench: Path) -> None:
     async def work() -> list[Outcome]:
-        tray = run_station(load_station(bench), Quiet())
+        tray = TrayRun(load_station(bench), Quiet())
         tray.units["left"].stop("wrong label")
         return await tray
 

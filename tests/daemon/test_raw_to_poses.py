@@ -17,7 +17,7 @@ from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import decoded, text
 from triaxcald.decoded import DecodedStream, beside_samples, only_finite
-from triaxcald.pipeline import Pipeline, together
+from triaxcald.raw_to_poses import Pipeline, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos

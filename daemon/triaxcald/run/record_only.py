@@ -21,7 +21,7 @@ from triaxcald.provision.identity import IdentityRead, WrongUnit
 from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.schema import BUS_RECORD, CALIBRATION, RAW, STATION_FILE
 from triaxcald.recording.writer import LOOK_S, Kind, RecordingWriter, ended_because
-from triaxcald.run.reasons import reason_of, trace_of
+from triaxcald.run.error_reasons import reason_of, trace_of
 from triaxcald.run.session import Segments, UnitSession, new_writer, stamp
 from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.schema.codes import Code
