@@ -7,13 +7,14 @@ import json
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
 from triaxcald.printable import printable_json
 from triaxcald.schema.codes import Stage
+from triaxcald.utc import iso_time
 
 if TYPE_CHECKING:
     from triaxcald.recording.schema import Phase
@@ -27,19 +28,19 @@ DRAIN_S = 30.0
 """Longest wait at the end for a reader that does not read."""
 
 
-def _now() -> datetime:
-    return datetime.now(UTC)
-
-
 class EventLines:
     """Writes each event at once, on a thread of its own: a reader that is slow or gone
     stops no measurement. ``write`` takes the bytes of a line; it may block, and raises
     OSError. ``runs`` maps the slots to the ids of their runs."""
 
     def __init__(
-        self, write: Callable[[bytes], object], tray: str, runs: Mapping[str, str], now: Callable[[], datetime] = _now
+        self,
+        write: Callable[[bytes], object],
+        tray: str,
+        runs: Mapping[str, str],
+        clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._write, self._tray, self._runs, self._now = write, tray, runs, now
+        self._write, self._tray, self._runs, self._clock_ns = write, tray, runs, clock_ns
         self._seq = 0
         self._latest: dict[str, object] = {}
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -109,7 +110,7 @@ class EventLines:
         line = {
             "format": "triaxcal.event/1",
             "seq": self._seq,
-            "time": self._now().isoformat(timespec="milliseconds"),
+            "time": iso_time(self._clock_ns()),
             "run": None if unit is None else self._runs.get(unit),
             "tray": self._tray,
             "unit": unit,
