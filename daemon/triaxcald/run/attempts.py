@@ -42,14 +42,10 @@ from triaxcald.recording.recover import Sealed, recover
 from triaxcald.recording.survey import survey
 from triaxcald.software import software
 from triaxcald.station.config import Limits, Station
+from triaxcald.station.lock import fcntl
 from triaxcald.store import History
 from triaxcald.utc import file_stamp, iso_time
 from triaxcald.work import Attempt, Work, wrong
-
-try:
-    import fcntl
-except ImportError:
-    fcntl = None  # type: ignore[assignment]
 
 FOLDER: Final = "running"
 FORMAT: Final = "triaxcal.attempt/1"
