@@ -327,6 +327,19 @@ def _line(commands: Any) -> None:
         "--events", action="store_true", help="one JSON object a line on standard output, as the work goes on"
     )
     p = _command(
+        commands, "serve", "serve:serve_command", "the service and the page of a station",
+        "People scan, turn and see PASS or FAIL in a browser; programs use the interface under /api/1. Runs, units and "
+        "figures are in triaxcal.sqlite in the station's folder, or in PostgreSQL.",
+        "serve station.toml", computes=True,
+    )  # fmt: skip
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--host", default="127.0.0.1", help="address to listen at; default: 127.0.0.1, this machine alone")
+    p.add_argument("--port", type=port, default=8484, help="default: 8484; 0 takes one that is free")
+    p.add_argument("--database", metavar="URL", help="of PostgreSQL; default: triaxcal.sqlite in the station's folder")
+    p.add_argument("--cert", metavar="FILE", type=Path, help="certificate (PEM), needed beyond this machine")
+    p.add_argument("--key", metavar="FILE", type=Path, help="its key (PEM)")
+    p.add_argument("--backup", metavar="FILE", type=Path, help="copy the database, also of a service at work, and end")
+    p = _command(
         commands, "sim", "stations:sim_command", "serve simulated units on their buses until stopped",
         "Several units are on one fixture, with one clock. It turns by itself; with --follow an operator turns it, who "
         "does what a run says: after the reaction_s of a device file's [fixture], 1 s by default, and in 1 of 50 turns "
