@@ -281,6 +281,7 @@ def register(commands: Any) -> None:
     _on_recordings(commands)
     _planning(commands)
     _devices(commands)
+    _access(commands)
     _audits(commands)
 
 
@@ -670,6 +671,67 @@ def _add_power_cycle(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
     )
+
+
+ROLES = ("reader", "operator", "engineer")
+
+
+def _access(commands: Any) -> None:
+    people = commands.add_parser("people", help="who may sign in to a station's service")
+    parts = people.add_subparsers(dest="part", required=True, metavar="add|list|pin|role|disable|enable")
+    for part, help_line, more in (
+        ("add", "add a person", ""),
+        ("list", "show the people and their roles", ""),
+        ("pin", "give a person another PIN", "Sessions of the person end."),
+        ("role", "give a person another role", "It counts at once."),
+        ("disable", "keep a person from signing in", "Sessions of the person end."),
+        ("enable", "let a disabled person sign in again", ""),
+    ):
+        example = {"list": "people list", "role": "people role Ada engineer", "add": "people add Ada --role operator"}
+        p = _command(
+            parts, part, f"serving:people_{part}", help_line, more,
+            f"{example.get(part, f'people {part} Ada')} --station station.toml",
+        )  # fmt: skip
+        if part != "list":
+            p.add_argument("name", metavar="NAME", help="1 to 64 printable characters")
+        if part == "role":
+            p.add_argument("role", metavar="|".join(ROLES), choices=ROLES)
+        if part == "add":
+            p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
+        if part in ("add", "pin"):
+            p.add_argument(
+                "--pin-file", metavar="FILE|-",
+                help="with the PIN, 4 to 64 characters; - for standard input; default: ask at the terminal",
+            )  # fmt: skip
+        _add_database(p)
+    token = commands.add_parser("token", help="which programs may use a station's service")
+    parts = token.add_subparsers(dest="part", required=True, metavar="new|list|revoke")
+    p = _command(
+        parts, "new", "serving:token_new", "make a token for a program",
+        "The token alone is on standard output; it is shown this once.",
+        "token new mes --role operator --station station.toml",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME", help="of the program, 1 to 64 printable characters")
+    p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
+    _add_database(p)
+    p = _command(
+        parts, "list", "serving:token_list", "show the tokens by their names", "", "token list --station station.toml"
+    )
+    _add_database(p)
+    p = _command(
+        parts, "revoke", "serving:token_revoke", "refuse a token from now on", "",
+        "token revoke mes --station station.toml",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME")
+    _add_database(p)
+
+
+def _add_database(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True)
+    p.add_argument(
+        "--database", metavar="URL",
+        help="of PostgreSQL, as for serve; default: triaxcal.sqlite in the station's folder",
+    )  # fmt: skip
 
 
 def _audits(commands: Any) -> None:
