@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -35,6 +34,7 @@ from triaxcald.station.buses import BusPlace
 from triaxcald.station.config import Place, Station, changed, check_lines, load_station
 from triaxcald.station.guidance import Guide
 from triaxcald.station.tray import Instruction
+from triaxcald.utc import iso_time
 
 if TYPE_CHECKING:
     from triaxcald.run.record_only import AtRecording, Kept, Roster
@@ -45,17 +45,13 @@ if TYPE_CHECKING:
 # Progress as one JSON object a line, for whoever collects logs.
 
 
-def _now() -> datetime:
-    return datetime.now(UTC)
-
-
 class JsonLines:
     """``time`` (UTC), ``level`` (``info``, ``warning``, ``error``), ``event``,
     ``unit`` where it is of one, and what else there is to say, to standard
     error by default."""
 
-    def __init__(self, out: TextIO | None = None, now: Callable[[], datetime] = _now) -> None:
-        self._out, self._now = out or sys.stderr, now
+    def __init__(self, out: TextIO | None = None, clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self._out, self._clock_ns = out or sys.stderr, clock_ns
 
     def stage(self, unit: str, stage: Stage) -> None:
         self.note(unit, text.STAGES[stage])
@@ -78,7 +74,7 @@ class JsonLines:
 
     def say(self, level: str, event: str, **more: Any) -> None:
         """Nowhere, where nobody reads any more: no work may fail for it."""
-        line = {"time": self._now().isoformat(timespec="milliseconds"), "level": level, "event": event, **more}
+        line = {"time": iso_time(self._clock_ns()), "level": level, "event": event, **more}
         with suppress(OSError, ValueError):
             self._out.write(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)) + "\n")
             self._out.flush()

@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from triaxcald.recording import disk
 from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic, preview_channels
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import versions
+from triaxcald.utc import iso_time
 
 # What is said of the times of a log, which stay as they are.
 
@@ -217,7 +217,7 @@ def _write(
             **file_told(source),
             **describe(importing),
             "samples": importing.counts,
-            "imported": datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="seconds"),
+            "imported": iso_time(time.time_ns(), "seconds"),
         }
         writer.event(IMPORTED, detail)
     return detail, importing.times.seconds

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,13 +42,10 @@ from triaxcald.recording.recover import Sealed, recover
 from triaxcald.recording.survey import survey
 from triaxcald.software import software
 from triaxcald.station.config import Limits, Station
+from triaxcald.station.lock import fcntl
 from triaxcald.store import History
+from triaxcald.utc import file_stamp, iso_time
 from triaxcald.work import Attempt, Work, wrong
-
-try:
-    import fcntl
-except ImportError:
-    fcntl = None  # type: ignore[assignment]
 
 FOLDER: Final = "running"
 FORMAT: Final = "triaxcal.attempt/1"
@@ -378,7 +375,7 @@ def _document(
             unit=attempt.work.slot,
             serial=file.serial,
             station=file.station,
-            ended=_time(_ended_ns(file)),
+            ended=iso_time(_ended_ns(file)),
             software=software(),
             supersedes=History.of(station.folder, file.serial).latest,
             journal=None if journal is None else str(journal),
@@ -422,13 +419,9 @@ def _ended_ns(file: AttemptFile) -> int:
     return max(times)
 
 
-def _time(time_ns: int) -> str:
-    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-
-
 def _stamp(started: str) -> str:
     """For the name of a file, of a time in ISO 8601."""
     try:
-        return datetime.fromisoformat(started).astimezone(UTC).strftime("%Y%m%dT%H%M%SZ")
+        return file_stamp(int(datetime.fromisoformat(started).timestamp()) * 1_000_000_000)
     except ValueError:
         return "killed"

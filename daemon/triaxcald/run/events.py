@@ -3,11 +3,12 @@ units."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from triaxcald.schema.codes import Code, Stage
+from triaxcald.utc import iso_time
 
 if TYPE_CHECKING:
     from triaxcald.recording.schema import Phase
@@ -21,7 +22,7 @@ FORMAT: Final = "triaxcal.event/1"
 class Events:
     """A `Progress` that hands each event of a tray to ``emit``. ``tray`` is the id of
     the tray, ``runs`` maps its slots to the ids of their runs. ``number`` gives the
-    `seq` of the next event, ``now`` the time."""
+    `seq` of the next event, ``clock_ns`` the time since 1970."""
 
     def __init__(
         self,
@@ -30,9 +31,9 @@ class Events:
         runs: Mapping[str, str],
         *,
         number: Callable[[], int],
-        now: Callable[[], datetime] = lambda: datetime.now(UTC),
+        clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._emit, self._tray, self._runs, self._number, self._now = emit, tray, runs, number, now
+        self._emit, self._tray, self._runs, self._number, self._clock_ns = emit, tray, runs, number, clock_ns
         self._latest: dict[str, object] = {}
 
     def started(self) -> None:
@@ -87,7 +88,7 @@ class Events:
             {
                 "format": FORMAT,
                 "seq": self._number(),
-                "time": self._now().isoformat(timespec="milliseconds"),
+                "time": iso_time(self._clock_ns()),
                 "run": None if unit is None else self._runs.get(unit),
                 "tray": self._tray,
                 "unit": unit,

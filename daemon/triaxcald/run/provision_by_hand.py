@@ -7,7 +7,6 @@ import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import triaxcal as tc
@@ -47,6 +46,7 @@ from triaxcald.station.config import Place, Station
 from triaxcald.station.output_check import live_output_warnings
 from triaxcald.station.power import power_cycle_asked
 from triaxcald.store import History
+from triaxcald.utc import file_stamp, iso_time
 from triaxcald.work import Attempt, Work, wrong
 
 
@@ -87,7 +87,7 @@ class ProvisionRun:
     def __post_init__(self) -> None:
         serial = self.serial if self.serial and wrong(self.serial) is None else self.place.unit.serial
         work = Work(self.place.unit.name, serial)
-        self._attempt = Attempt(self.id, self._now(), work)
+        self._attempt = Attempt(self.id, iso_time(self.clock_ns()), work)
 
     async def run(self) -> Provisioned:
         """Provision. Raises nothing, not even when cancelled: the outcome has every
@@ -185,9 +185,6 @@ class ProvisionRun:
         serial = self.serial or self.place.unit.serial
         return open_journal(self.station.folder, self.place.bundle.profile, self.place.unit.name, serial)
 
-    def _now(self) -> str:
-        return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
-
     def _done(self) -> str:
         assert self.provisioning is not None
         if self.dry_run:
@@ -205,7 +202,7 @@ class ProvisionRun:
             unit=self.place.unit.name,
             serial=p.identity.serial if p else None,
             station=self.station.file.name,
-            ended=self._now(),
+            ended=iso_time(self.clock_ns()),
             software=software(),
             supersedes=history.latest,
             journal=str(self._open_journal) if self._open_journal else None,
@@ -215,8 +212,7 @@ class ProvisionRun:
 
     def _write(self, document: tc.interchange.Document) -> Path:
         """Raises InputError."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
-        stem = f"{document['serial'] or self.place.unit.name}-{stamp}"
+        stem = f"{document['serial'] or self.place.unit.name}-{file_stamp(self.clock_ns())}"
         return write_new(self.station.folder, stem, SUFFIX, to_text(document))
 
     def _error(self, ending: Ending) -> str | None:

@@ -22,7 +22,7 @@ from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.schema import BUS_RECORD, CALIBRATION, RAW, STATION_FILE
 from triaxcald.recording.writer import LOOK_S, Kind, RecordingWriter, ended_because
 from triaxcald.run.error_reasons import reason_of, trace_of
-from triaxcald.run.session import Segments, UnitSession, new_writer, stamp
+from triaxcald.run.session import Segments, UnitSession, new_writer
 from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.schema.codes import Code
 from triaxcald.software import versions
@@ -33,6 +33,7 @@ from triaxcald.station.listening import Listened, RawRecords, ReconnectingBus
 from triaxcald.station.lock import locked
 from triaxcald.station.reconnect import RetryPolicy
 from triaxcald.text import NOTHING_YET
+from triaxcald.utc import file_stamp
 
 
 @dataclass(frozen=True)
@@ -410,7 +411,7 @@ class BusRecording(AtRecording):
 
 
 def bus_recording_name(bus: str, time_ns: int) -> str:
-    return f"{bus}-{stamp(time_ns)}.mcap"
+    return f"{bus}-{file_stamp(time_ns)}.mcap"
 
 
 # Recording of a unit.

@@ -26,6 +26,7 @@ from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import HOLE_S, ReconnectingDevice, RetryPolicy, Streaming
+from triaxcald.utc import file_stamp
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,6 @@ def new_writer(path: Path, segments: Segments | None, **settings: Any) -> Record
     from triaxcald.recording.segments import SegmentedWriter  # which reads recordings too
 
     return SegmentedWriter(path, **settings, **vars(segments))
-
-
-def stamp(time_ns: int) -> str:
-    """A time in UTC for the name of a file."""
-    return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns / 1e9))
 
 
 class UnitSession:
@@ -139,7 +135,7 @@ class UnitSession:
         return await take_snapshot(RegisterLink(device, self.profile, name=self.place.device_name), self.place.bundle)
 
     def recording_name(self, identity: IdentityRead) -> str:
-        return f"{self.name}-{identity.serial or 'unknown'}-{stamp(self.clock_ns())}.mcap"
+        return f"{self.name}-{identity.serial or 'unknown'}-{file_stamp(self.clock_ns())}.mcap"
 
     def recording_path(self, identity: IdentityRead) -> Path:
         folder = self.station.folder

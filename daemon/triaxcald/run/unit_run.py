@@ -8,7 +8,6 @@ import time
 from collections.abc import Awaitable, Callable, Generator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,7 +50,7 @@ from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.orders import require_allowed, require_serial
-from triaxcald.run.session import UnitSession, stamp
+from triaxcald.run.session import UnitSession
 from triaxcald.run.together import side_by_side
 from triaxcald.run.tray_progress import TrayProgress
 from triaxcald.run.write_back import WriteBack, corrected
@@ -63,6 +62,7 @@ from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.station.tray import Tray
 from triaxcald.store import History
+from triaxcald.utc import file_stamp, iso_time
 from triaxcald.verification import Verification, fitted_attitudes
 from triaxcald.work import RECORD as WORK_RECORD
 from triaxcald.work import Attempt, Work
@@ -132,7 +132,7 @@ class UnitRun(UnitSession):
         self.stopped_for: str | None = None
         """Reason of a stop of this unit alone."""
         self._attempts, self._start = attempts, start
-        self._attempt = Attempt(self.id, self._now(), work or Work(self.name, place.unit.serial))
+        self._attempt = Attempt(self.id, iso_time(clock_ns()), work or Work(self.name, place.unit.serial))
         self._attempt_file: AttemptFile | None = None
         self._history = History()
         self._answered = False
@@ -269,9 +269,6 @@ class UnitRun(UnitSession):
             **self._rezero_record,
         }
 
-    def _now(self) -> str:
-        return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
-
     async def _ending(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
             return await self._line(device, identity, writer)
@@ -334,7 +331,7 @@ class UnitRun(UnitSession):
             unit=self.name,
             serial=self._serial,
             station=self.station.file.name,
-            ended=self._now(),
+            ended=iso_time(self.clock_ns()),
             software=software(),
             supersedes=self._history.latest if self._serial is not None else None,
             journal=self._journal,
@@ -360,7 +357,7 @@ class UnitRun(UnitSession):
         outcome last."""
         if self._recording is None:
             if self._document is not None:  # the attempt came to no recording
-                stem = f"{self.name}-{self._serial or 'unknown'}-{stamp(self.clock_ns())}"
+                stem = f"{self.name}-{self._serial or 'unknown'}-{file_stamp(self.clock_ns())}"
                 self._paths[ATTACHMENT] = write_new(self.station.folder, stem, SUFFIX, to_text(self._document))
             return
         artifacts = dict(self._artifacts)
@@ -480,7 +477,7 @@ class UnitRun(UnitSession):
             ask=self._ask,
             run=self.id,
             on_settled=self._settled,
-            started=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="seconds"),
+            started=iso_time(self.clock_ns(), "seconds"),
             force=self.force,
         )
         assert self._confirmation is not None

@@ -6,11 +6,11 @@ from __future__ import annotations
 import asyncio
 import shutil
 import sys
+import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from triaxcald.errors import DaemonError, InputError
@@ -23,6 +23,7 @@ from triaxcald.service.desk import Desk, Scanned
 from triaxcald.service.errors import ApiError, Problem
 from triaxcald.service.stream import Stream
 from triaxcald.station.config import Station, check_lines
+from triaxcald.utc import iso_time
 from triaxcald.work import wrong
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Book(Protocol):
 
 
 def now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
+    return iso_time(time.time_ns())
 
 
 class Floor:

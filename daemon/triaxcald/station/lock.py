@@ -30,7 +30,7 @@ import triaxcal_drivers as td
 from triaxcald.errors import DeviceInUse, DeviceInUseElsewhere, StationError
 
 try:
-    import fcntl
+    import fcntl as fcntl  # also for the other modules that lock files
 except ImportError:
     fcntl = None  # type: ignore[assignment]
 

@@ -21,12 +21,7 @@ from pydantic import BaseModel
 import triaxcal_drivers as td
 from triaxcald.printable import printable
 from triaxcald.provision.identity import same_serial
-from triaxcald.station.lock import folder
-
-try:
-    import fcntl
-except ImportError:
-    fcntl = None  # type: ignore[assignment]
+from triaxcald.station.lock import fcntl, folder
 
 PREFIX, SUFFIX = "triaxcal-sim-", ".json"
 FILE_BYTES = 1 << 18

@@ -7,7 +7,7 @@ import os
 import sqlite3
 import stat
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -85,7 +85,7 @@ class Database:
     def on(self, work: Callable[[sqlite3.Connection], T]) -> T:
         """What ``work`` gives. It is called again from its beginning where the database
         had to be made anew."""
-        replaced = False
+        replaced = emptied = False
         while True:
             try:
                 self._leave_what_was_removed()
@@ -102,6 +102,9 @@ class Database:
                     continue
                 if before is not None:
                     before.close()
+                if not emptied and self._empty():
+                    emptied = True
+                    continue
                 if replaced or not self._set_aside():
                     self._use_memory(None)
                 replaced = True
@@ -151,6 +154,25 @@ class Database:
         except OSError:
             return False
         return True
+
+    def _empty(self) -> bool:
+        """Make the tables of the outcomes anew in a sound file that also holds those of
+        a service. False where that cannot be done."""
+        try:
+            with closing(_connected(self.path)) as db:
+                others = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
+                if self._present_inode() is None or not db.execute(others).fetchone()[0]:
+                    return False
+                if db.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
+                    return False
+                with transaction(db):
+                    for table in ("file", "run"):
+                        db.execute(f"DROP TABLE IF EXISTS {table}")
+                    for statement in _outcome_tables():
+                        db.execute(statement)
+                return True
+        except (sqlite3.Error, UnicodeDecodeError):
+            return False
 
     def _use_memory(self, before: sqlite3.Connection | None) -> None:
         """In memory, with what is in the tables ``before`` as far as it can be read."""

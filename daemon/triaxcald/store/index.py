@@ -144,6 +144,45 @@ class Store:
                 return Runs([], [])  # no index in a folder without an outcome
             return self._database.on(work)
 
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each outcome in the folder, by its name. Raises OSError where the
+        folder cannot be read."""
+
+        def work(db: sqlite3.Connection) -> dict[str, str]:
+            self._refresh(db)
+            return dict(db.execute("SELECT outcome, outcome_sha256 FROM run"))
+
+        with self._lock:
+            return self._database.on(work)
+
+    def rows(self, outcomes: Sequence[str]) -> list[dict[str, Cell]]:
+        """The rows of these outcomes as they were last read, with all columns of the
+        index."""
+
+        def work(db: sqlite3.Connection) -> list[dict[str, Cell]]:
+            marks = ", ".join("?" * len(outcomes))
+            found = db.execute(f"SELECT * FROM run WHERE outcome IN ({marks})", tuple(outcomes)).fetchall()
+            return [dict(zip((*NAMES, *OWN), (*self._present(row), *row[len(NAMES) :]), strict=True)) for row in found]
+
+        with self._lock:
+            return self._database.on(work)
+
+    def make(self) -> None:
+        """Make the file of the index, also in a folder without an outcome."""
+        with self._lock:
+            self._database.on(lambda _: None)
+
+    def forget(self) -> None:
+        """Forget all outcomes: the next look at the folder reads them anew."""
+
+        def work(db: sqlite3.Connection) -> None:
+            with transaction(db):
+                db.execute("DELETE FROM file")
+                db.execute("DELETE FROM run")
+
+        with self._lock:
+            self._database.on(work)
+
     def _present(self, row: Cells) -> Cells:
         """The cells of `NAMES`, without names of files that are not in the folder.
         Raises sqlite3.DatabaseError where a cell is not as it was written."""

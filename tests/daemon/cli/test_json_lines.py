@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import io
 import json
-from datetime import UTC, datetime
 
 from triaxcald.cli.record import JsonLines
 from triaxcald.schema.codes import Code
 
-NOW = datetime(2026, 3, 1, 12, 0, 0, 250_000, UTC)
+NOW_NS = 1_772_366_400_250_000_000
 
 
 def test_each_line_is_an_object_with_time_level_and_event() -> None:
     out = io.StringIO()
-    lines = JsonLines(out, lambda: NOW)
+    lines = JsonLines(out, lambda: NOW_NS)
     lines.note("unit0", "recording")
     lines.lost("unit0", Code.ABSENT, "nothing answers\nat node 5")
     lines.say("error", "ended", unit="unit0", lost=3)

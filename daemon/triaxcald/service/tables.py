@@ -1,0 +1,175 @@
+"""The tables of the service. `run` and `file` of a folder's `triaxcal.sqlite` belong to
+`triaxcald.store`; a PostgreSQL server, which several stations share, has a table `run`
+of the same columns.
+
+``home`` is the name of the station in whose folder a run is. Times end in ``_us``
+(microseconds since 1970) or are texts in ISO 8601, UTC.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Double,
+    ForeignKey,
+    Identity,
+    Index,
+    Integer,
+    MetaData,
+    PrimaryKeyConstraint,
+    Table,
+    Text,
+    UniqueConstraint,
+)  # fmt: skip
+
+from triaxcald.schema.columns import COLUMNS, Kind
+from triaxcald.store import OWN_COLUMNS
+
+metadata: Final = MetaData()
+
+_TYPES: Final[dict[Kind, Any]] = {Kind.TEXT: Text, Kind.TEXTS: Text, Kind.WHOLE: BigInteger, Kind.NUMBER: Double}
+
+
+def _of_run() -> list[Column[Any]]:
+    cells = [Column(c.name, _TYPES[c.kind], nullable=not c.required) for c in COLUMNS]
+    return [*cells, *(Column(name, BigInteger, nullable=False) for name in OWN_COLUMNS)]
+
+
+local_run: Final = Table("run", MetaData(), *_of_run(), PrimaryKeyConstraint("outcome"))
+"""As `triaxcald.store` makes it, in SQLite."""
+
+shared_run: Final = Table(
+    "run", MetaData(), Column("home", Text, nullable=False), *_of_run(), PrimaryKeyConstraint("home", "outcome")
+)
+"""In PostgreSQL."""
+Index("run_serial", shared_run.c.serial)
+Index("run_at", shared_run.c.at_us, shared_run.c.outcome)
+
+filed: Final = Table(
+    "filed", metadata,
+    Column("home", Text, nullable=False),
+    Column("outcome", Text, nullable=False),
+    Column("outcome_sha256", Text, nullable=False),
+    Column("run", Text),
+    Column("serial", Text),
+    Column("plain_serial", Text, index=True),
+    Column("at_us", BigInteger, nullable=False),
+    Column("ended_us", BigInteger, nullable=False),
+    Column("tried", Boolean, nullable=False),
+    Column("verdict", Text, nullable=False),
+    Column("code", Text),
+    PrimaryKeyConstraint("home", "outcome"),
+)  # fmt: skip
+"""Outcomes from which rows of the other tables are made."""
+
+unit: Final = Table(
+    "unit", metadata,
+    Column("home", Text, nullable=False),
+    Column("plain_serial", Text, nullable=False),
+    Column("serial", Text, nullable=False),
+    Column("first_us", BigInteger, nullable=False),
+    Column("last_us", BigInteger, nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("passed", Boolean, nullable=False),
+    Column("verdict", Text, nullable=False),
+    Column("code", Text),
+    Column("run", Text),
+    PrimaryKeyConstraint("home", "plain_serial"),
+)  # fmt: skip
+"""One row for each serial number; verdict, code and run are those of the last run."""
+
+measurement: Final = Table(
+    "measurement", metadata,
+    Column("home", Text, nullable=False),
+    Column("outcome", Text, nullable=False),
+    Column("run", Text),
+    Column("name", Text, nullable=False),
+    Column("value", Double, nullable=False),
+    Column("unit", Text, nullable=False),
+    Column("low", Double),
+    Column("high", Double),
+    Column("passed", Boolean),
+    PrimaryKeyConstraint("home", "outcome", "name"),
+)  # fmt: skip
+
+person: Final = Table(
+    "person", metadata,
+    Column("name", Text, primary_key=True),
+    Column("role", Text, nullable=False),
+    Column("pin", Text, nullable=False),
+    Column("disabled", Boolean, nullable=False),
+    Column("created", Text, nullable=False),
+)  # fmt: skip
+"""``pin`` is the hash by argon2."""
+
+token: Final = Table(
+    "token", metadata,
+    Column("hash", Text, primary_key=True),
+    Column("name", Text, nullable=False),
+    Column("role", Text, nullable=False),
+    Column("created", Text, nullable=False),
+    Column("revoked", Text),
+)  # fmt: skip
+"""``hash`` is the SHA-256 of the token."""
+
+session: Final = Table(
+    "session", metadata,
+    Column("hash", Text, primary_key=True),
+    Column("person", Text, ForeignKey("person.name"), nullable=False, index=True),
+    Column("used_s", Double, nullable=False),
+)  # fmt: skip
+
+trail: Final = Table(
+    "trail", metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), Identity(), primary_key=True),
+    Column("time", Text, nullable=False),
+    Column("home", Text, nullable=False),
+    Column("who", Text),
+    Column("role", Text),
+    Column("action", Text, nullable=False),
+    Column("what", Text, nullable=False),
+    Column("ok", Boolean, nullable=False),
+    Column("code", Text),
+)  # fmt: skip
+"""Append-only, by triggers. ``what`` is a JSON object."""
+
+outbox: Final = Table(
+    "outbox", metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), Identity(), primary_key=True),
+    Column("home", Text, nullable=False),
+    Column("receiver", Text, nullable=False),
+    Column("run", Text, nullable=False),
+    Column("outcome", Text, nullable=False),
+    Column("state", Text, nullable=False),
+    Column("tries", Integer, nullable=False),
+    Column("added_us", BigInteger, nullable=False),
+    Column("ended_us", BigInteger),
+    Column("error", Text),
+    UniqueConstraint("home", "receiver", "run"),
+)  # fmt: skip
+"""``state`` is `waiting`, `delivered` or `refused`; ``added_us`` and ``ended_us`` are
+the times of entry and end, ``error`` is of the last try."""
+Index("outbox_waiting", outbox.c.home, outbox.c.receiver, outbox.c.state, outbox.c.id)
+
+event: Final = Table(
+    "event", metadata,
+    Column("home", Text, nullable=False),
+    Column("seq", BigInteger, nullable=False),
+    Column("run", Text, index=True),
+    Column("event", Text, nullable=False),
+    PrimaryKeyConstraint("home", "seq"),
+)  # fmt: skip
+"""``event`` is a `triaxcal.event/1`."""
+
+setting: Final = Table(
+    "setting", metadata,
+    Column("home", Text, nullable=False),
+    Column("key", Text, nullable=False),
+    Column("value", Text, nullable=False),
+    PrimaryKeyConstraint("home", "key"),
+)  # fmt: skip
+"""``value`` is JSON."""
