@@ -18,11 +18,13 @@ from fastapi import FastAPI
 from triaxcald.errors import InputError, StationError
 from triaxcald.service.access import Access, session_router
 from triaxcald.service.api import answer_errors, station_router
+from triaxcald.service.api_data import data_router
 from triaxcald.service.floor import Floor
 from triaxcald.service.gate import StationServer, configured, known_hosts
 from triaxcald.service.ledger import Ledger
 from triaxcald.service.monitoring import monitoring_router
 from triaxcald.service.outbox import Outbox
+from triaxcald.service.page import page_router
 from triaxcald.service.stream import Stream
 from triaxcald.service.supervisor import Supervisor
 from triaxcald.station.config import Station, load_station
@@ -64,7 +66,7 @@ def app_of(service: StationService) -> FastAPI:
     """The interface and the pages of a service."""
     app = FastAPI(title="triaxcal", version="1", docs_url=None, redoc_url=None, openapi_url="/api/1/openapi.json")
     app.include_router(session_router(service.access))
-    for router in (station_router, monitoring_router):
+    for router in (station_router, data_router, monitoring_router, page_router):
         app.include_router(router(service))
     answer_errors(app)
     return app
