@@ -1,5 +1,5 @@
-"""A shift at a station: fifty units through the interface, with every kind of trouble. Database, folder and receiver say
-the same afterwards, and each run is there once."""
+"""A shift at a station: fifty units through the interface, with every kind of trouble. Database, folder and receiver
+say the same afterwards, and each run is there once."""
 
 from __future__ import annotations
 
