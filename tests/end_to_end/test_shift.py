@@ -375,7 +375,7 @@ def _agree(shift: Shift, receiver: Receiver, codes: Sequence[str], triaxcal: Any
     by_run = {document["run"]: document for document in documents}
     assert len(by_run) == len(documents)
     assert receiver.refused_tokens == 0
-    assert Counter(run for run, _ in receiver.taken) == Counter(by_run)
+    assert Counter(run for run, _ in receiver.taken) == Counter(list(by_run))
     for run, body in receiver.taken:
         result = json.loads(body)
         assert Result.model_validate(result).document() == result
