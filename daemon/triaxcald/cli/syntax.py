@@ -733,7 +733,7 @@ def _access(commands: Any) -> None:
 
 
 def _add_database(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True)
+    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True, help="whose service it is")
     p.add_argument(
         "--database", metavar="URL",
         help="of PostgreSQL, as for serve; default: triaxcal.sqlite in the station's folder",
