@@ -558,6 +558,13 @@ class Ledger:
             row = db.execute(query.order_by(out.c.id).limit(1)).first()
         return None if row is None else Waiting(*row)
 
+    def has_delivered(self, receiver: str) -> bool:
+        """Whether a result ever reached the receiver."""
+        out = tables.outbox
+        here = and_(out.c.home == self.home, out.c.receiver == receiver, out.c.state == DELIVERED)
+        with self.reading() as db:
+            return db.execute(select(out.c.id).where(here).limit(1)).first() is not None
+
     def end_delivery(self, waiting: Waiting, error: str | None) -> None:
         """The result is delivered, or refused for good with this ``error``."""
         values: dict[str, Any] = {"ended_us": time.time_ns() // 1000, "error": error}
