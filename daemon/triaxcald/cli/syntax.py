@@ -310,6 +310,12 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
+    p.add_argument(
+        "--page",
+        action="store_true",
+        help="on the page of a station, which runs a tray by itself",
+    )
+    p.add_argument("--port", type=port, default=8484, help="of the page; default: 8484")
     add_json(p)
     p = _command(
         commands, "run", "stations:run_command", "the whole line on the devices of a station file",
@@ -689,7 +695,7 @@ def _access(commands: Any) -> None:
     ):
         example = {"list": "people list", "role": "people role Ada engineer", "add": "people add Ada --role operator"}
         p = _command(
-            parts, part, f"serving:people_{part}", help_line, more,
+            parts, part, f"people:people_{part}", help_line, more,
             f"{example.get(part, f'people {part} Ada')} --station station.toml",
         )  # fmt: skip
         if part != "list":
@@ -707,7 +713,7 @@ def _access(commands: Any) -> None:
     token = commands.add_parser("token", help="which programs may use a station's service")
     parts = token.add_subparsers(dest="part", required=True, metavar="new|list|revoke")
     p = _command(
-        parts, "new", "serving:token_new", "make a token for a program",
+        parts, "new", "people:token_new", "make a token for a program",
         "The token alone is on standard output; it is shown this once.",
         "token new mes --role operator --station station.toml",
     )  # fmt: skip
@@ -715,11 +721,11 @@ def _access(commands: Any) -> None:
     p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
     _add_database(p)
     p = _command(
-        parts, "list", "serving:token_list", "show the tokens by their names", "", "token list --station station.toml"
+        parts, "list", "people:token_list", "show the tokens by their names", "", "token list --station station.toml"
     )
     _add_database(p)
     p = _command(
-        parts, "revoke", "serving:token_revoke", "refuse a token from now on", "",
+        parts, "revoke", "people:token_revoke", "refuse a token from now on", "",
         "token revoke mes --station station.toml",
     )  # fmt: skip
     p.add_argument("name", metavar="NAME")

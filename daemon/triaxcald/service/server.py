@@ -18,11 +18,13 @@ from fastapi import FastAPI
 from triaxcald.errors import InputError, StationError
 from triaxcald.service.access import Access, session_router
 from triaxcald.service.api import answer_errors, station_router
+from triaxcald.service.api_data import data_router
 from triaxcald.service.floor import Floor
 from triaxcald.service.gate import StationServer, configured, known_hosts
 from triaxcald.service.ledger import Ledger
 from triaxcald.service.monitoring import monitoring_router
 from triaxcald.service.outbox import Outbox
+from triaxcald.service.page import page_router
 from triaxcald.service.stream import Stream
 from triaxcald.service.supervisor import Supervisor
 from triaxcald.station.config import Station, load_station
@@ -64,7 +66,7 @@ def app_of(service: StationService) -> FastAPI:
     """The interface and the pages of a service."""
     app = FastAPI(title="triaxcal", version="1", docs_url=None, redoc_url=None, openapi_url="/api/1/openapi.json")
     app.include_router(session_router(service.access))
-    for router in (station_router, monitoring_router):
+    for router in (station_router, data_router, monitoring_router, page_router):
         app.include_router(router(service))
     answer_errors(app)
     return app
@@ -77,10 +79,11 @@ async def serve(
     *,
     log: Callable[[str], None],
     reload: asyncio.Event,
-    ready: Callable[[str], None],
+    ready: Callable[[str, StationService], None],
 ) -> None:
-    """Serve until cancelled; then end the runs in order. ``ready`` receives the URL,
-    ``reload`` asks for the station file to be read again. Raises DaemonError."""
+    """Serve until cancelled; then end the runs in order. ``ready`` receives the URL and
+    the service once it answers, ``reload`` asks for the station file to be read again.
+    Raises DaemonError."""
     with bound(address) as listening:
         ledger = await asyncio.to_thread(Ledger.open, station, database)
         hosts = known_hosts(address.host, listening.getsockname()[1], secure=address.secure)
@@ -126,7 +129,7 @@ async def _serve(
     address: Address,
     listening: socket.socket,
     reload: asyncio.Event,
-    ready: Callable[[str], None],
+    ready: Callable[[str, StationService], None],
 ) -> None:
     port = listening.getsockname()[1]
     server = _Server(configured(app_of(service), service.access, cert=address.certificate, key=address.key))
@@ -136,7 +139,7 @@ async def _serve(
     try:
         await asyncio.wait([answering, begun], return_when=asyncio.FIRST_COMPLETED)
         async with Supervisor().kept_informed(partial(status, service)):
-            ready(address.url(port))
+            ready(address.url(port), service)
             await asyncio.wait([answering, reloading], return_when=asyncio.FIRST_COMPLETED)
             for task in (answering, reloading):
                 if task.done():

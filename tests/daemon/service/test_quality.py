@@ -17,7 +17,8 @@ def row(number: int, serial: str | None, verdict: str = "pass", **more: Any) -> 
     code = {"pass": "within_limits", "fail": "fit_outside", "aborted": "lost", "not_judged": "no_limit"}[verdict]
     return {
         **{column.name: None for column in COLUMNS}, "run": f"run-{number}", "outcome": f"{number:06d}.outcome.json",
-        "serial": serial, "verdict": verdict, "code": code, "attempt": 1, "ended": f"2026-01-01T00:{number:04d}", **more,
+        "serial": serial, "verdict": verdict, "code": code, "attempt": 1, "ended": f"2026-01-01T00:{number:04d}",
+        **more,
     }  # fmt: skip
 
 
@@ -33,7 +34,7 @@ def test_a_unit_counts_by_its_first_and_by_its_last_judged_run() -> None:
     assert found["first_pass_yield"] == pytest.approx(1 / 3)
     assert found["yield"] == pytest.approx(2 / 3)
     assert found["codes"] == {"lost": 4, "fit_outside": 2, "within_limits": 2, "no_limit": 1}
-    assert list(found["codes"])[0] == "lost"
+    assert next(iter(found["codes"])) == "lost"
 
 
 def test_nothing_has_no_yield() -> None:
