@@ -400,6 +400,15 @@ def _line(commands: Any) -> None:
     p.add_argument("--until", metavar="TIME", help="runs that began before this time, or on or before this date")
     p.add_argument("--serial", help="runs of this serial number, reported or expected")
     p.add_argument("--code", type=_code, metavar="CODE", help="runs that ended with this code, as fit_outside")
+    p.add_argument(
+        "--rebuild", action="store_true",
+        help="read all outcomes anew, and make the rows of the database from them",
+    )  # fmt: skip
+    p.add_argument(
+        "--database",
+        metavar="URL",
+        help="with --rebuild: rows of the station in PostgreSQL, postgresql://USER@HOST/NAME",
+    )
     p.add_argument("-o", "--output", type=Path, metavar="TABLE", help=".csv, .csv.gz or .parquet")
     add_json(p)
 
