@@ -1,0 +1,117 @@
+// How well the station works: yield, why runs do not pass, and figures over time.
+
+import { amount, ask, characteristicName, element, failure, figure, meaning, percent, scaleOf, timeOf, word } from "./common.js";
+import { controlChart, fitted, pareto } from "./chart.js";
+import { asked, fillFilter } from "./results.js";
+
+const PPK_LEAST = 30;
+const content = document.getElementById("content");
+fillFilter(document.getElementById("filter"));
+
+function summary(q) {
+  const shares = (interval) => (interval ? word("quality.interval", { low: percent(interval[0]), high: percent(interval[1]) }) : "");
+  const rows = [
+    ["quality.units", q.units.toLocaleString(), ""],
+    ["quality.attempts", q.attempts.toLocaleString(), ""],
+    ["quality.first_pass", percent(q.first_pass_yield), shares(q.first_pass_yield_interval)],
+    ["quality.yield", percent(q.yield), shares(q.yield_interval)],
+  ];
+  return element("dl", { class: "figures" }, rows.map(([key, value, more]) =>
+    element("div", {}, element("dt", {}, word(key)), element("dd", {}, value, more ? element("small", {}, more) : null))));
+}
+
+function reasons(q) {
+  const bars = Object.entries(q.codes).filter(([code, count]) => count && code !== "within_limits")
+    .map(([name, count]) => ({ name, count, title: meaning(name) }));
+  const filter = asked();
+  const href = (code) => {
+    filter.set("code", code);
+    return `/runs?${filter}`;
+  };
+  return element("section", { class: "panel" }, element("h2", {}, word("quality.pareto")),
+    bars.length
+      ? element("div", { class: "wide" }, pareto({ bars, href, heads: [word("runs.code"), word("quality.count"), word("quality.share")] }))
+      : element("p", { class: "muted" }, word("quality.pareto_none")));
+}
+
+function ppk(c) {
+  if (c.low === null && c.high === null) return word("quality.ppk_no_limit");
+  if (c.ppk === null) return word("quality.ppk_few", { least: PPK_LEAST });
+  const [low, high] = c.ppk_interval;
+  return `${figure(c.ppk, 3)} (${figure(low, 3)}–${figure(high, 3)})`;
+}
+
+function characteristics(list, pick) {
+  const heads = [["quality.characteristic"], ["quality.n", "n"], ["quality.mean", "n"], ["quality.sd", "n"], ["quality.low", "n"],
+    ["quality.high", "n"], ["quality.ppk", "n"]];
+  return element("section", { class: "panel" }, element("h2", {}, word("quality.characteristics")),
+    element("div", { class: "wide" }, element("table", { class: "stack" },
+      element("thead", {}, element("tr", {}, heads.map(([key, kind]) => element("th", { scope: "col", class: kind }, word(key))))),
+      element("tbody", {}, list.map((c) => {
+        const told = (value, digits) => amount(c.name, c.unit, value, digits);
+        const cells = [String(c.n), told(c.mean), told(c.sd, 3), told(c.low), told(c.high), ppk(c)];
+        return element("tr", {},
+          element("th", { scope: "row" }, element("button", { type: "button", class: "link name", onclick: () => pick(c.name) }, characteristicName(c.name))),
+          cells.map((cell, i) => element("td", { class: "n", "data-label": word(heads[i + 1][0]) }, cell)));
+      })))));
+}
+
+/** Individuals and moving ranges of a characteristic. */
+function charts(c) {
+  if (!c.chart || c.chart.points.length < 2) return [element("p", { class: "muted" }, word("quality.few"))];
+  const { points, individuals, moving_range } = c.chart;
+  const label = (p, value) => [p.serial, timeOf(p.time), amount(c.name, c.unit, value, 5)].filter(Boolean).join(", ");
+  const name = characteristicName(c.name);
+  const out = (value, lines) => (lines.lower !== null && value < lines.lower) || (lines.upper !== null && value > lines.upper);
+  const { factor, unit } = scaleOf(c.name, c.unit);
+  const scaled = (v) => (v === null || v === undefined ? null : v * factor);
+  const title = (kind) => `${name}${unit ? `, ${unit}` : ""}: ${word(kind)}`;
+  const linesOf = (lines, spec) => [
+    { value: scaled(lines.centre), kind: "centre" }, { value: scaled(lines.lower), kind: "control" }, { value: scaled(lines.upper), kind: "control" },
+    ...spec.map((value) => ({ value: scaled(value), kind: "spec" })),
+  ];
+  const marked = (value, p, lines) => ({
+    value: scaled(value), out: value !== null && out(value, lines), label: label(p, value), href: `/runs/${encodeURIComponent(p.run)}`,
+  });
+  return [
+    fitted(title("quality.individuals"), (given) => controlChart({
+      ...given, lines: linesOf(individuals, [c.low, c.high]),
+      points: points.map((p) => marked(p.value, p, individuals)),
+    })),
+    fitted(title("quality.moving_range"), (given) => controlChart({
+      ...given, lines: linesOf(moving_range, []), height: 180,
+      points: points.map((p, i) => marked(i ? Math.abs(p.value - points[i - 1].value) : null, p, moving_range)),
+    })),
+    element("p", { class: "muted" }, word("quality.chart_note")),
+  ];
+}
+
+try {
+  const q = await ask(`/api/1/quality?${asked()}`);
+  if (!q.attempts) content.replaceChildren(element("p", { class: "panel" }, word("quality.none")));
+  else {
+    const list = q.characteristics;
+    const place = element("div");
+    const choice = element("select", { id: "characteristic" }, list.map((c) => element("option", { value: c.name }, characteristicName(c.name))));
+    const show = () => place.replaceChildren(...charts(list.find((c) => c.name === choice.value)));
+    const pick = (name) => {
+      choice.value = name;
+      show();
+      choice.scrollIntoView({ block: "nearest" });
+      choice.focus();
+    };
+    choice.addEventListener("change", show);
+    content.replaceChildren(...[
+      summary(q), reasons(q),
+      list.length ? element("section", { class: "panel" },
+        element("div", { class: "pick" }, element("label", { for: "characteristic" }, word("quality.chart")), choice), place) : null,
+      list.length ? characteristics(list, pick) : null,
+    ].filter(Boolean));
+    if (list.length) show();
+  }
+} catch (error) {
+  content.replaceChildren(failure(error));
+}
+content.removeAttribute("aria-busy");
+const csv = document.getElementById("csv");
+csv.href = `/api/1/runs.csv?${asked()}`;

@@ -1,0 +1,64 @@
+// What the pages of results share: the filter, and a table of runs.
+
+import { characteristicName, element, meaning, microG, runLink, timeOf, unitLink, verdictTag, word } from "./common.js";
+
+const TIMES = ["since", "until"];
+
+/** Fills the form from the address. */
+export function fillFilter(form) {
+  for (const [key, value] of new URLSearchParams(location.search)) {
+    const field = form.elements.namedItem(key);
+    if (field) field.value = value;
+  }
+  if (matchMedia("(max-width: 36rem)").matches) form.closest("details").open = false;
+  // What is empty asks for nothing: it stays out of the address.
+  form.addEventListener("submit", (e) => {
+    e.preventDefault();
+    const given = [...new FormData(form)].map(([key, value]) => [key, String(value).trim()]).filter(([, value]) => value);
+    location.search = new URLSearchParams(given).toString();
+  });
+}
+
+/** What the address asks for, as the interface takes it: times in UTC. */
+export function asked(...more) {
+  const query = new URLSearchParams();
+  for (const [key, value] of new URLSearchParams(location.search)) {
+    if (["lang", "theme"].includes(key) || !value) continue;
+    const time = TIMES.includes(key) ? new Date(value) : null;
+    query.set(key, time && !Number.isNaN(time.getTime()) ? time.toISOString() : value);
+  }
+  for (const [key, value] of more) query.set(key, value);
+  return query;
+}
+
+/** Runs as rows; `whole` also shows the serial number. */
+export function runsTable(runs, { whole = true } = {}) {
+  const columns = [
+    ["runs.ended", (r) => runLink(r.run, timeOf(r.ended)), "time"],
+    whole ? ["card.serial", (r) => unitLink(r.serial ?? r.work_serial)] : null,
+    ["runs.verdict", (r) => verdictTag(r.verdict)],
+    ["runs.code", (r) => (r.code ? element("span", { title: r.reason }, meaning(r.code)) : r.reason), "text"],
+    ["runs.error", (r) => errorOf(r), "n"],
+    ["card.slot", (r) => r.slot ?? r.unit],
+    ["runs.attempt", (r) => r.attempt ?? "–", "n"],
+    ["work.order", (r) => r.order ?? "–"],
+    ["work.part_number", (r) => r.part_number ?? "–"],
+    ["work.fixture", (r) => r.fixture ?? "–"],
+    ["work.operator", (r) => r.operator ?? "–"],
+  ].filter(Boolean);
+  return element("div", { class: "panel wide" },
+    element("table", { class: "stack" },
+      element("thead", {}, element("tr", {}, columns.map(([key, , kind]) => element("th", { scope: "col", class: kind }, word(key))))),
+      element("tbody", {}, runs.map((run) =>
+        element("tr", {}, columns.map(([key, cell, kind]) => element("td", { class: kind, "data-label": word(key) }, cell(run))))))));
+}
+
+function errorOf(run) {
+  const [value, limit] = [run.verification_rms_g, run.verification_rms_limit_g];
+  const outside = value !== null && limit !== null && value > limit;
+  return outside ? element("span", { class: "outside" }, `▲ ${microG(value)}`) : microG(value);
+}
+
+/** Names of the characteristics that a row of `triaxcal.results/1` has, with units. */
+export const COEFFICIENTS = [["scale_factor", ""], ["misalignment", "rad"], ["bias", "g"]]
+  .flatMap(([name, unit]) => ["x", "y", "z"].map((axis) => ({ name: `${name}_${axis}`, unit, title: characteristicName(`${name}_${axis}`) })));
