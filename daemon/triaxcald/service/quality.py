@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -50,51 +50,80 @@ mean moving ranges (ASTM E2587)."""
 RUN_OF: Final = 8
 """Values in a row on one side of the centre (Western Electric rule 4)."""
 
+JUDGED: Final = (Verdict.PASS, Verdict.FAIL)
+
 Row = Mapping[str, Any]
 Floats = NDArray[np.float64]
 
 
-@dataclass
-class _Unit:
-    """A unit's attempts in the order of time."""
+class _Attempts:
+    """The attempts among rows, and the unit of each."""
 
-    rows: list[Row] = field(default_factory=list)
+    def __init__(self, rows: Iterable[Row]) -> None:
+        self.rows: list[Row] = []
+        self.by_unit: dict[str, list[Row]] = {}
+        """By plain serial number: that of the work, else the one that the unit
+        reported. Without either, nobody knows the unit."""
+        seen: set[str] = set()
+        number: dict[str, int] = {}
+        units = []
+        for row in rows:
+            if not row["tried"] or row["run"] in seen:  # the folder may hold a copy of an outcome
+                continue
+            if row["run"] is not None:
+                seen.add(row["run"])
+            self.rows.append(row)
+            serial = _serial(row)
+            if serial is None:
+                units.append(-1)
+                continue
+            plain = plain_serial(serial)
+            self.by_unit.setdefault(plain, []).append(row)
+            units.append(number.setdefault(plain, len(number)))
+        self._units = np.array(units, dtype=np.intp)
+        order = sorted(range(len(units)), key=lambda i: (self.rows[i]["ended"], self.rows[i]["run"] or ""))
+        self._rank = np.empty(len(units), dtype=np.intp)
+        self._rank[order] = np.arange(len(units))
 
-    def judged(self) -> Iterator[Row]:
-        return (row for row in self.rows if row["verdict"] in (Verdict.PASS, Verdict.FAIL))
-
-    def last(self) -> Row | None:
-        """The last attempt that says something about the unit."""
-        return next((row for row in reversed(self.rows) if row["verdict"] != Verdict.NOT_JUDGED), None)
-
-    def last_with(self, name: str) -> Row | None:
-        return next((row for row in reversed(self.rows) if row[name] is not None), None)
+    def measured(self, name: str) -> tuple[list[Row], Floats]:
+        """The attempt that gives each unit's value, its last one with the figure, in
+        the order of their ends; and the values."""
+        values = np.array([row[name] for row in self.rows], dtype=float)  # NaN for None
+        having = np.flatnonzero(np.isfinite(values) & (self._units >= 0))
+        last = np.full(len(self.by_unit), -1, dtype=np.intp)
+        np.maximum.at(last, self._units[having], having)
+        chosen = last[last >= 0]
+        chosen = chosen[np.argsort(self._rank[chosen])]
+        return [self.rows[i] for i in chosen.tolist()], values[chosen]
 
 
 def quality_of(rows: Iterable[Row], first_judged_us: Mapping[str, int] | None = None) -> dict[str, Any]:
     """`triaxcal.quality/1` of these rows. ``first_judged_us`` has the time of the first
     judged attempt at a unit, by plain serial number, also where that is not among the
     rows."""
-    attempts = _attempts(rows)
-    units = _units(attempts)
-    counted = {serial: unit for serial, unit in units.items() if unit.last() is not None}
-    passed = sum(unit.last()["verdict"] == Verdict.PASS for unit in counted.values())  # type: ignore[index]
-    before = first_judged_us or {}
-    first = [next(unit.judged(), None) for serial, unit in counted.items() if not _judged_before(unit, serial, before)]
-    passed_first = sum(row is not None and row["verdict"] == Verdict.PASS for row in first)
-    codes = Counter(row["code"] for row in attempts if row["code"] is not None)
+    attempts, before = _Attempts(rows), first_judged_us or {}
+    passed, passed_first = [], []
+    for serial, of_unit in attempts.by_unit.items():
+        if (last := _last(of_unit)) is None:
+            continue
+        passed.append(last["verdict"] == Verdict.PASS)
+        first = next((row for row in of_unit if row["verdict"] in JUDGED), None)
+        at_us = (first or of_unit[0])["at_us"]
+        if before.get(serial, at_us) >= at_us:
+            passed_first.append(first is not None and first["verdict"] == Verdict.PASS)
+    codes = Counter(row["code"] for row in attempts.rows if row["code"] is not None)
     return {
         "format": "triaxcal.quality/1",
-        "units": len(units),
-        "first_pass_yield": _share(passed_first, len(first)),
-        "first_pass_yield_interval": _rounded(share_interval(passed_first, len(first))),
-        "first_pass_units": len(first),
-        "yield": _share(passed, len(counted)),
-        "yield_interval": _rounded(share_interval(passed, len(counted))),
-        "yield_units": len(counted),
-        "attempts": len(attempts),
+        "units": len(attempts.by_unit),
+        "first_pass_yield": _share(passed_first),
+        "first_pass_yield_interval": _rounded(share_interval(sum(passed_first), len(passed_first))),
+        "first_pass_units": len(passed_first),
+        "yield": _share(passed),
+        "yield_interval": _rounded(share_interval(sum(passed), len(passed))),
+        "yield_units": len(passed),
+        "attempts": len(attempts.rows),
         "codes": dict(sorted(codes.items(), key=lambda item: (-item[1], item[0]))),
-        "characteristics": [found for name in UNITS if (found := _characteristic(name, units)) is not None],
+        "characteristics": [found for name in UNITS if (found := _characteristic(name, attempts)) is not None],
     }
 
 
@@ -102,58 +131,31 @@ def chart_of(rows: Iterable[Row], name: str, most: int) -> dict[str, Any]:
     """`triaxcal.chart/1` of a characteristic, with the last ``most`` values as points.
     Raises KeyError for a name that is none of `UNITS`."""
     unit = UNITS[name]
-    measured = _measured(name, _units(_attempts(rows)))
-    found = individuals([float(row[name]) for row in measured])
+    measured, values = _Attempts(rows).measured(name)
+    found = individuals(values)
     low = None if found.low is None or (name in FIGURES and found.low < 0) else found.low
-    start = max(0, len(measured) - most)
+    limits = {
+        "centre": found.centre, "low": low, "high": found.high, "mr_mean": found.mr_mean, "mr_high": found.mr_high,
+        "limit": _limit(name, measured[-1]) if measured else None,
+    }  # fmt: skip
     return {
         "format": "triaxcal.chart/1",
         "name": name,
         "unit": unit,
         "n": len(measured),
-        "points": [_point(name, found, i, measured[i]) for i in range(start, len(measured))],
-        **{
-            key: tc.rounding.number(value)
-            for key, value in (
-                ("centre", found.centre), ("low", low), ("high", found.high), ("mr_mean", found.mr_mean),
-                ("mr_high", found.mr_high), ("limit", _limit(name, measured[-1]) if measured else None),
-            )
-        },
-    }  # fmt: skip
+        "points": [_point(name, found, i, measured[i]) for i in range(max(0, len(measured) - most), len(measured))],
+        **{key: tc.rounding.number(value) for key, value in limits.items()},
+    }
 
 
-def _attempts(rows: Iterable[Row]) -> list[Row]:
-    """Each once: the folder may hold a copy of an outcome."""
-    seen: set[str] = set()
-    found = []
-    for row in rows:
-        if row["tried"] and row["run"] not in seen:
-            found.append(row)
-            if row["run"] is not None:
-                seen.add(row["run"])
+def _serial(row: Row) -> str | None:
+    found: str | None = row["serial"] if row["work_serial"] is None else row["work_serial"]
     return found
 
 
-def _units(attempts: Iterable[Row]) -> dict[str, _Unit]:
-    """By plain serial number: that of the work, else the one that the unit reported.
-    Without either, nobody knows the unit."""
-    found: dict[str, _Unit] = {}
-    for row in attempts:
-        serial = row["serial"] if row["work_serial"] is None else row["work_serial"]
-        if serial is not None:
-            found.setdefault(plain_serial(serial), _Unit()).rows.append(row)
-    return found
-
-
-def _judged_before(unit: _Unit, serial: str, first_judged_us: Mapping[str, int]) -> bool:
-    here = next(unit.judged(), unit.rows[0])
-    return bool(first_judged_us.get(serial, here["at_us"]) < here["at_us"])
-
-
-def _measured(name: str, units: Mapping[str, _Unit]) -> list[Row]:
-    """The attempt that gives each unit's value, in the order of their ends."""
-    found = [row for unit in units.values() if (row := unit.last_with(name)) is not None]
-    return sorted(found, key=lambda row: (row["ended"], row["run"] or ""))
+def _last(of_unit: Sequence[Row]) -> Row | None:
+    """The last attempt that says something about the unit."""
+    return next((row for row in reversed(of_unit) if row["verdict"] != Verdict.NOT_JUDGED), None)
 
 
 def _limit(name: str, row: Row) -> float | None:
@@ -161,12 +163,11 @@ def _limit(name: str, row: Row) -> float | None:
     return None if column is None else row[column]
 
 
-def _characteristic(name: str, units: Mapping[str, _Unit]) -> dict[str, Any] | None:
+def _characteristic(name: str, attempts: _Attempts) -> dict[str, Any] | None:
     """None where no unit has the figure."""
-    measured = _measured(name, units)
+    measured, values = attempts.measured(name)
     if not measured:
         return None
-    values = np.array([row[name] for row in measured], dtype=float)
     limits = [_limit(name, row) for row in measured]
     high, n = limits[-1], len(values)
     mean, sd = float(values.mean()), float(values.std(ddof=1)) if n > 1 else None
@@ -186,8 +187,8 @@ def _characteristic(name: str, units: Mapping[str, _Unit]) -> dict[str, Any] | N
     }
 
 
-def _share(count: int, of: int) -> float | None:
-    return tc.rounding.number(count / of) if of else None
+def _share(passed: Sequence[bool]) -> float | None:
+    return tc.rounding.number(sum(passed) / len(passed)) if passed else None
 
 
 def _rounded(interval: tuple[float, float] | None) -> list[float | None] | None:
@@ -258,7 +259,7 @@ class Individuals:
     """By value: `limits` or `run` for one that breaks a rule."""
 
 
-def individuals(values: Sequence[float]) -> Individuals:
+def individuals(values: Sequence[float] | Floats) -> Individuals:
     """Limits from the mean moving range of all values, which drifts and steps widen
     little."""
     x = np.asarray(values, dtype=float)
@@ -282,7 +283,7 @@ def _point(name: str, chart: Individuals, i: int, row: Row) -> dict[str, Any]:
     moved = float(chart.moving_ranges[i - 1]) if i else None
     return {
         "run": row["run"],
-        "serial": row["serial"] if row["work_serial"] is None else row["work_serial"],
+        "serial": _serial(row),
         "time": row["ended"],
         "value": row[name],
         "moving_range": tc.rounding.number(moved),
