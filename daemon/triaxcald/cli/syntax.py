@@ -310,6 +310,12 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
+    p.add_argument(
+        "--page",
+        action="store_true",
+        help="on the page of a station, which runs a tray by itself",
+    )
+    p.add_argument("--port", type=port, default=8484, help="of the page; default: 8484")
     add_json(p)
     p = _command(
         commands, "run", "stations:run_command", "the whole line on the devices of a station file",
@@ -394,6 +400,15 @@ def _line(commands: Any) -> None:
     p.add_argument("--until", metavar="TIME", help="runs that began before this time, or on or before this date")
     p.add_argument("--serial", help="runs of this serial number, reported or expected")
     p.add_argument("--code", type=_code, metavar="CODE", help="runs that ended with this code, as fit_outside")
+    p.add_argument(
+        "--rebuild", action="store_true",
+        help="read all outcomes anew, and make the rows of the database from them",
+    )  # fmt: skip
+    p.add_argument(
+        "--database",
+        metavar="URL",
+        help="with --rebuild: rows of the station in PostgreSQL, postgresql://USER@HOST/NAME",
+    )
     p.add_argument("-o", "--output", type=Path, metavar="TABLE", help=".csv, .csv.gz or .parquet")
     add_json(p)
 

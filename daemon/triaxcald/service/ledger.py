@@ -47,6 +47,8 @@ FIGURES: Final = ("rms_g", "cross_validated_rms_g", "verification_rms_g")
 """Measurements with a limit."""
 COEFFICIENTS: Final = {"scale_factor": "output/g", "misalignment": "rad", "bias": "g"}
 WAITING, DELIVERED, REFUSED = "waiting", "delivered", "refused"
+RECEIVER: Final = "receiver "
+"""Key of a setting, before the receiver's name."""
 NAMED: Final = "receiver"
 """Action in the trail: a receiver was first named."""
 TAIL: Final = 1 << 20
@@ -115,19 +117,18 @@ class Delivery:
 
 
 class Ledger:
-    """The database of the service at a station. Use `open`."""
+    """The database of the service at a station. Use `open` or `of_folder`."""
 
-    def __init__(self, station: Station, url: str | None) -> None:
-        self.station = station.file.name
-        self.folder = station.folder
+    def __init__(self, station: str, folder: Path, receivers: tuple[str, ...], url: str | None) -> None:
+        self.station, self.folder = station, folder
         self.lost: str | None = None
         """What people have to do where the file was damaged or removed."""
         self._file = SqliteFile(self.folder / FILE_NAME, self._prepare_file) if url is None else None
         self.engine: Engine = postgresql_engine(url) if url is not None else self._sqlite_file.engine
         self.home = tables.HERE if url is None else self.station
-        self._receivers = tuple(receiver.name for receiver in station.file.deliver)
+        self._receivers = receivers
         self._since_us: dict[str, int] = {}
-        self._store = Store(station.folder)
+        self._store = Store(folder)
         self._taking = threading.Lock()
         self._trailing = threading.Lock()
 
@@ -138,21 +139,36 @@ class Ledger:
             station.folder.mkdir(parents=True, exist_ok=True)
         except OSError as e:
             raise InputError(f"{station.folder}: no folder for recordings: {e.strerror}") from e
-        ledger = Ledger(station, url)
+        ledger = Ledger(station.file.name, station.folder, _receivers(station), url)
+        ledger._begin()
+        return ledger
+
+    @staticmethod
+    def of_folder(folder: Path, station: str, url: str | None = None) -> Ledger:
+        """Without the station's file, whose name is ``station``. Raises InputError,
+        DatabaseError."""
+        ledger = Ledger(station, folder, (), url)
+        ledger._begin()
+        setting = tables.setting
+        query = select(setting.c.key).where(setting.c.home == ledger.home, setting.c.key.startswith(RECEIVER))
+        with ledger.reading() as db:
+            ledger._receivers = tuple(key.removeprefix(RECEIVER) for key in db.execute(query).scalars())
+        return ledger
+
+    def _begin(self) -> None:
         try:
-            if not ledger._sqlite:
-                migrate(ledger.engine)
-                ledger._join_trail(ledger.engine)
-            with ledger.reading():
+            if not self._sqlite:
+                migrate(self.engine)
+                self._join_trail(self.engine)
+            with self.reading():
                 pass
         except BaseException:
-            ledger.close()
+            self.close()
             raise
-        return ledger
 
     def receive(self, station: Station) -> None:
         """The station file was read again."""
-        self._receivers = tuple(receiver.name for receiver in station.file.deliver)
+        self._receivers = _receivers(station)
 
     def close(self) -> None:
         self.engine.dispose()
@@ -344,7 +360,7 @@ class Ledger:
             return
         found: dict[str, int] = {}
         for receiver in self._receivers:
-            key = f"receiver {receiver}"
+            key = RECEIVER + receiver
             since_us = self.setting(key)
             if since_us is None and (since_us := self._first_named(receiver)) is None:
                 since_us = time.time_ns() // 1_000_000_000 * 1_000_000
@@ -599,6 +615,13 @@ class Ledger:
             row = db.execute(query.order_by(out.c.id).limit(1)).first()
         return None if row is None else Waiting(*row)
 
+    def has_delivered(self, receiver: str) -> bool:
+        """Whether a result ever reached the receiver."""
+        out = tables.outbox
+        here = and_(out.c.home == self.home, out.c.receiver == receiver, out.c.state == DELIVERED)
+        with self.reading() as db:
+            return db.execute(select(out.c.id).where(here).limit(1)).first() is not None
+
     def end_delivery(self, waiting: Waiting, error: str | None) -> None:
         """The result is delivered, or refused for good with this ``error``."""
         values: dict[str, Any] = {"ended_us": time.time_ns() // 1000, "error": error}
@@ -683,6 +706,10 @@ def _document(row: Mapping[Any, Any], exists: Callable[[str], bool]) -> dict[str
         if found[name] is not None and not exists(found[name]):
             found[name] = None
     return found
+
+
+def _receivers(station: Station) -> tuple[str, ...]:
+    return tuple(receiver.name for receiver in station.file.deliver)
 
 
 def _last_lines(path: Path, size: int | None) -> list[bytes]:

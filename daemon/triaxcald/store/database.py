@@ -168,8 +168,7 @@ class Database:
         a service. False where that cannot be done."""
         try:
             with closing(_connected(self.path)) as db:
-                others = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
-                if self._present_inode() is None or not db.execute(others).fetchone()[0]:
+                if self._present_inode() is None or not has_service(db):
                     return False
                 if db.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
                     return False
@@ -208,6 +207,12 @@ def transaction(db: sqlite3.Connection) -> Iterator[None]:
             with suppress(sqlite3.Error):
                 db.execute("ROLLBACK")
         raise
+
+
+def has_service(db: sqlite3.Connection) -> bool:
+    """Whether a service has tables in the file."""
+    query = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
+    return bool(db.execute(query).fetchone()[0])
 
 
 def _connected(path: Path | str) -> sqlite3.Connection:

@@ -21,7 +21,7 @@ from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
-from triaxcald.store.database import OWN, TIMES, Database, transaction
+from triaxcald.store.database import OWN, TIMES, Database, has_service, transaction
 from triaxcald.store.rows import BESIDE, Cell, NoOutcome, cells_of
 
 BATCH = 500
@@ -174,6 +174,11 @@ class Store:
             self._database.on(lambda _: None)
             return not self._database.in_memory
 
+    def has_service(self) -> bool:
+        """Whether the file also has the tables of a service."""
+        with self._lock:
+            return self._database.exists and self._database.on(has_service)
+
     @property
     def in_memory(self) -> bool:
         """Whether there could be no file. The next call after `close` tries again."""
@@ -188,7 +193,8 @@ class Store:
                 db.execute("DELETE FROM run")
 
         with self._lock:
-            self._database.on(work)
+            if self._database.exists:
+                self._database.on(work)
 
     def _present(self, row: Cells) -> Cells:
         """The cells of `NAMES`, without names of files that are not in the folder.

@@ -90,7 +90,7 @@ class Book:
     def last_seq(self) -> int:
         return self.events[-1]["seq"] if self.events else 0
 
-    def run(self, run: str) -> dict[str, Any] | None:
+    def run_of(self, run: str) -> dict[str, Any] | None:
         return next((row for row in self.rows if row["run"] == run), None)
 
 
