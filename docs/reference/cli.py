@@ -86,6 +86,15 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "restore": """The source is a recording (`registers-before.json`) or a journal; its registers go only to the unit with their serial number. Document `triaxcal.restoration/1` with `device_state`, `evidence`, `registers`, `error`, `outcome` and `outcome_file`.""",  # noqa: E501
     "registers": """Document `triaxcal.registers/1`.""",
     "devices": """Document `triaxcal.devices/1`.""",
+    "people add": """The roles are `reader`, `operator` and `engineer`; each may do what those before it may. The PIN has 4 to 64 characters, and only its argon2 hash is stored. It is asked twice at the terminal, or is the only line of `--pin-file`. Every change of people and tokens is a row of the trail, and counts at once in a service that runs.""",  # noqa: E501
+    "people list": """By name, with the role and whether the person is disabled.""",
+    "people pin": """Ends all sessions of the person. An unknown name is an error (exit 2), here and below.""",
+    "people role": """Sessions of the person go on with the new role.""",
+    "people disable": """Ends all sessions of the person, who stays in the list and in the trail.""",
+    "people enable": """The person signs in with the PIN of before.""",
+    "token new": """Programs send `Authorization: Bearer TOKEN`. Only the SHA-256 of the token is stored. Of one name there is one token that is not revoked (exit 2).""",  # noqa: E501
+    "token list": """In the order of time, revoked ones too.""",
+    "token revoke": """The name is free for another token.""",
     "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. A signal ends it with the number of recordings audited so far. Document `triaxcal.audit/1`.""",  # noqa: E501
     "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501

@@ -48,9 +48,17 @@ EXTRAS = {
     "asammdf": "logs",
     "rosbags": "logs",
     "lz4": "logs",
+    "fastapi": "serve",
+    "uvicorn": "serve",
+    "sse_starlette": "serve",
+    "sqlalchemy": "serve",
+    "alembic": "serve",
+    "httpx": "serve",
+    "argon2": "serve",
+    "psycopg": "postgres",
 }
 """Extra of each module, by import name."""
-CALLED = {"can": "python-can", "serial": "pyserial"}
+CALLED = {"can": "python-can", "serial": "pyserial", "sse_starlette": "sse-starlette", "argon2": "argon2-cffi"}
 """Package names that differ from the import name."""
 
 

@@ -281,6 +281,7 @@ def register(commands: Any) -> None:
     _on_recordings(commands)
     _planning(commands)
     _devices(commands)
+    _access(commands)
     _audits(commands)
 
 
@@ -326,6 +327,19 @@ def _line(commands: Any) -> None:
     p.add_argument(
         "--events", action="store_true", help="one JSON object a line on standard output, as the work goes on"
     )
+    p = _command(
+        commands, "serve", "serve:serve_command", "the service and the page of a station",
+        "People scan, turn and see PASS or FAIL in a browser; programs use the interface under /api/1. Runs, units and "
+        "figures are in triaxcal.sqlite in the station's folder, or in PostgreSQL.",
+        "serve station.toml", computes=True,
+    )  # fmt: skip
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--host", default="127.0.0.1", help="address to listen at; default: 127.0.0.1, this machine alone")
+    p.add_argument("--port", type=port, default=8484, help="default: 8484; 0 takes one that is free")
+    p.add_argument("--database", metavar="URL", help="of PostgreSQL; default: triaxcal.sqlite in the station's folder")
+    p.add_argument("--cert", metavar="FILE", type=Path, help="certificate (PEM), needed beyond this machine")
+    p.add_argument("--key", metavar="FILE", type=Path, help="its key (PEM)")
+    p.add_argument("--backup", metavar="FILE", type=Path, help="copy the database, also of a service at work, and end")
     p = _command(
         commands, "sim", "stations:sim_command", "serve simulated units on their buses until stopped",
         "Several units are on one fixture, with one clock. It turns by itself; with --follow an operator turns it, who "
@@ -657,6 +671,67 @@ def _add_power_cycle(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
     )
+
+
+ROLES = ("reader", "operator", "engineer")
+
+
+def _access(commands: Any) -> None:
+    people = commands.add_parser("people", help="who may sign in to a station's service")
+    parts = people.add_subparsers(dest="part", required=True, metavar="add|list|pin|role|disable|enable")
+    for part, help_line, more in (
+        ("add", "add a person", ""),
+        ("list", "show the people and their roles", ""),
+        ("pin", "give a person another PIN", "Sessions of the person end."),
+        ("role", "give a person another role", "It counts at once."),
+        ("disable", "keep a person from signing in", "Sessions of the person end."),
+        ("enable", "let a disabled person sign in again", ""),
+    ):
+        example = {"list": "people list", "role": "people role Ada engineer", "add": "people add Ada --role operator"}
+        p = _command(
+            parts, part, f"people:people_{part}", help_line, more,
+            f"{example.get(part, f'people {part} Ada')} --station station.toml",
+        )  # fmt: skip
+        if part != "list":
+            p.add_argument("name", metavar="NAME", help="1 to 64 printable characters")
+        if part == "role":
+            p.add_argument("role", metavar="|".join(ROLES), choices=ROLES)
+        if part == "add":
+            p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
+        if part in ("add", "pin"):
+            p.add_argument(
+                "--pin-file", metavar="FILE|-",
+                help="with the PIN, 4 to 64 characters; - for standard input; default: ask at the terminal",
+            )  # fmt: skip
+        _add_database(p)
+    token = commands.add_parser("token", help="which programs may use a station's service")
+    parts = token.add_subparsers(dest="part", required=True, metavar="new|list|revoke")
+    p = _command(
+        parts, "new", "people:token_new", "make a token for a program",
+        "The token alone is on standard output; it is shown this once.",
+        "token new mes --role operator --station station.toml",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME", help="of the program, 1 to 64 printable characters")
+    p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
+    _add_database(p)
+    p = _command(
+        parts, "list", "people:token_list", "show the tokens by their names", "", "token list --station station.toml"
+    )
+    _add_database(p)
+    p = _command(
+        parts, "revoke", "people:token_revoke", "refuse a token from now on", "",
+        "token revoke mes --station station.toml",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME")
+    _add_database(p)
+
+
+def _add_database(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True)
+    p.add_argument(
+        "--database", metavar="URL",
+        help="of PostgreSQL, as for serve; default: triaxcal.sqlite in the station's folder",
+    )  # fmt: skip
 
 
 def _audits(commands: Any) -> None:

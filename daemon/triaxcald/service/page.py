@@ -49,7 +49,7 @@ class Access(Protocol):
 
 
 class Ledger(Protocol):
-    def run(self, id: str) -> dict[str, Any] | None:
+    def run_of(self, run_id: str, /) -> dict[str, Any] | None:
         """A row of `triaxcal.results/1`. Blocks, raises DaemonError."""
 
 
@@ -204,7 +204,7 @@ def page_router(service: Service) -> APIRouter:
     @router.get("/runs/{run}/trace")
     async def trace(request: Request, run: str) -> Response:
         await service.access.require(request, "reader")
-        row = await asyncio.to_thread(service.ledger.run, run)
+        row = await asyncio.to_thread(service.ledger.run_of, run)
         name = None if row is None else row.get("recording")
         if name is None:
             raise ApiError(Problem.UNKNOWN, f"run {run} has no recording")
