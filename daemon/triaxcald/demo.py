@@ -96,6 +96,12 @@ async def run_demo(folder: Path, seed: int, progress: Progress, ended: Callable[
     ]
 
 
+def demo_effects(seed: int) -> list[tuple[str, dict[str, float]]]:
+    """Two different effects with their sizes, one for each unit."""
+    rng = np.random.default_rng(seed)
+    return [(str(effect), _draw(str(effect), rng)) for effect in rng.choice(HIDDEN, 2, replace=False)]
+
+
 def _devices(seed: int, channel: str) -> list[DeviceFile]:
     rng = np.random.default_rng(seed)
     effects = rng.choice(HIDDEN, 2, replace=False)

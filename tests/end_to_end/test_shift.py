@@ -1,5 +1,5 @@
-"""A shift at a station: fifty units through the interface, with every kind of trouble. Database, folder and receiver say
-the same afterwards, and each run is there once."""
+"""A shift at a station: fifty units through the interface, with every kind of trouble. Database, folder and receiver
+say the same afterwards, and each run is there once."""
 
 from __future__ import annotations
 
@@ -375,7 +375,7 @@ def _agree(shift: Shift, receiver: Receiver, codes: Sequence[str], triaxcal: Any
     by_run = {document["run"]: document for document in documents}
     assert len(by_run) == len(documents)
     assert receiver.refused_tokens == 0
-    assert Counter(run for run, _ in receiver.taken) == Counter(by_run)
+    assert Counter(run for run, _ in receiver.taken) == Counter(list(by_run))
     for run, body in receiver.taken:
         result = json.loads(body)
         assert Result.model_validate(result).document() == result

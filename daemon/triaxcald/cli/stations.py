@@ -219,6 +219,10 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
 def demo_command(a: argparse.Namespace) -> int:
     if fault := td.hints.absent(("can", "pymodbus")):
         raise InputError(f"demo: {fault}")
+    if a.page:
+        from triaxcald.cli.serve import demo_page
+
+        return demo_page(a)
     from triaxcald.demo import run_demo
     from triaxcald.schema.run import Demo
 
@@ -289,7 +293,7 @@ def sim_command(a: argparse.Namespace) -> int:
         source = ServiceEvents(a.follow) if of_service else Source(a.follow)
     tray = load_tray(a.devices, followed=source is not None)
     try:
-        run_interruptible(_serve(tray, source))
+        run_interruptible(simulated(tray, source))
     except Interrupted as e:
         if e.number == signal.SIGINT:
             raise
@@ -297,7 +301,8 @@ def sim_command(a: argparse.Namespace) -> int:
     return 0
 
 
-async def _serve(tray: Tray, source: Source | ServiceEvents | None) -> None:
+async def simulated(tray: Tray, source: Source | ServiceEvents | None) -> None:
+    """Serve the units of a tray on their buses until cancelled."""
     from triaxcald.simulation.follow import follow
     from triaxcald.simulation.unit import keep_eeprom
     from triaxcald.station.simulators import Simulator, announced

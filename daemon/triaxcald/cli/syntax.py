@@ -310,6 +310,12 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
+    p.add_argument(
+        "--page",
+        action="store_true",
+        help="on the page of a station, which runs a tray by itself",
+    )
+    p.add_argument("--port", type=port, default=8484, help="of the page; default: 8484")
     add_json(p)
     p = _command(
         commands, "run", "stations:run_command", "the whole line on the devices of a station file",

@@ -30,7 +30,7 @@ from triaxcald.service.database import (
     sqlite_engine,
 )
 from triaxcald.station.config import Station
-from triaxcald.store import FILE_NAME, OWN_COLUMNS, Store
+from triaxcald.store import BESIDE, FILE_NAME, OWN_COLUMNS, Store
 from triaxcald.work import plain_serial
 
 EVENTS_KEPT: Final = 10_000
@@ -332,20 +332,20 @@ class Ledger:
         with self.reading() as db:
             rows = db.execute(query).mappings().all()
         following = _cursor(rows[limit - 1]) if len(rows) > limit else None
-        return [_document(row) for row in rows[:limit]], following
+        return [self._document(row) for row in rows[:limit]], following
 
     def every(self, wanted: RunFilter) -> list[dict[str, Any]]:
         """All these runs, in the order of time."""
         run = self.run
         query = self._wanted(select(run), wanted).order_by(run.c.at_us, run.c.outcome)
         with self.reading() as db:
-            return [_document(row) for row in db.execute(query).mappings()]
+            return [self._document(row) for row in db.execute(query).mappings()]
 
     def run_of(self, run_id: str) -> dict[str, Any] | None:
         """The run of that id."""
         with self.reading() as db:
             row = db.execute(self._here(select(self.run)).where(self.run.c.run == run_id)).mappings().first()
-        return None if row is None else _document(row)
+        return None if row is None else self._document(row)
 
     def unit(self, serial: str) -> list[dict[str, Any]]:
         """All runs of a unit, in the order of time."""
@@ -359,6 +359,16 @@ class Ledger:
         with self.reading() as db:
             found = [{key: row[key] for key in keys} for row in db.execute(query).mappings()]
         return sorted(found, key=lambda m: MEASUREMENTS.index(m["name"]))
+
+    def _document(self, row: Mapping[Any, Any]) -> dict[str, Any]:
+        """A run with the columns of `results`; files that are gone have no name."""
+        found = {name: row[name] for name in NAMES}
+        for name in _TEXTS:
+            found[name] = None if row[name] is None else json.loads(row[name])
+        for name in BESIDE:
+            if row[name] is not None and not os.path.lexists(self.folder / row[name]):
+                found[name] = None
+        return found
 
     def _wanted(self, query: Select[Any], wanted: RunFilter) -> Select[Any]:
         run, filed = self.run, tables.filed
@@ -562,11 +572,6 @@ def measurements_of(row: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 MEASUREMENTS: Final = (*FIGURES, *(f"{kind}_{axis}" for kind in COEFFICIENTS for axis in "xyz"))
 """Names of the measurements, in order."""
 _TEXTS: Final = frozenset(c.name for c in COLUMNS if c.kind is Kind.TEXTS)
-
-
-def _document(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """A run with the columns of `results`."""
-    return {name: json.loads(row[name]) if name in _TEXTS and row[name] is not None else row[name] for name in NAMES}
 
 
 def _cursor(row: Mapping[Any, Any]) -> str:

@@ -79,10 +79,11 @@ async def serve(
     *,
     log: Callable[[str], None],
     reload: asyncio.Event,
-    ready: Callable[[str], None],
+    ready: Callable[[str, StationService], None],
 ) -> None:
-    """Serve until cancelled; then end the runs in order. ``ready`` receives the URL,
-    ``reload`` asks for the station file to be read again. Raises DaemonError."""
+    """Serve until cancelled; then end the runs in order. ``ready`` receives the URL and
+    the service once it answers, ``reload`` asks for the station file to be read again.
+    Raises DaemonError."""
     with bound(address) as listening:
         ledger = await asyncio.to_thread(Ledger.open, station, database)
         hosts = known_hosts(address.host, listening.getsockname()[1], secure=address.secure)
@@ -128,7 +129,7 @@ async def _serve(
     address: Address,
     listening: socket.socket,
     reload: asyncio.Event,
-    ready: Callable[[str], None],
+    ready: Callable[[str, StationService], None],
 ) -> None:
     port = listening.getsockname()[1]
     server = _Server(configured(app_of(service), service.access, cert=address.certificate, key=address.key))
@@ -138,7 +139,7 @@ async def _serve(
     try:
         await asyncio.wait([answering, begun], return_when=asyncio.FIRST_COMPLETED)
         async with Supervisor().kept_informed(partial(status, service)):
-            ready(address.url(port))
+            ready(address.url(port), service)
             await asyncio.wait([answering, reloading], return_when=asyncio.FIRST_COMPLETED)
             for task in (answering, reloading):
                 if task.done():

@@ -7,6 +7,6 @@ missing, damaged or behind them.
 from triaxcald.store.database import FILE_NAME
 from triaxcald.store.database import OWN as OWN_COLUMNS
 from triaxcald.store.index import History, Runs, Store
-from triaxcald.store.rows import microseconds
+from triaxcald.store.rows import BESIDE, microseconds
 
-__all__ = ["FILE_NAME", "OWN_COLUMNS", "History", "Runs", "Store", "microseconds"]
+__all__ = ["BESIDE", "FILE_NAME", "OWN_COLUMNS", "History", "Runs", "Store", "microseconds"]
