@@ -132,7 +132,7 @@ def data_router(service: DataService) -> APIRouter:
             content_disposition_type="inline" if shown else "attachment",
         )  # fmt: skip
 
-    @router.get("/units/{serial}")
+    @router.get("/units/{serial:path}")
     async def unit(request: Request, serial: str) -> JSONResponse:
         await access.require(request, "reader")
         found = await asyncio.to_thread(ledger.unit, serial)

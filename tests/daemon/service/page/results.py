@@ -16,6 +16,7 @@ FAILED = {
 RUNS = 55
 RETESTED = "SN-1005"
 LIMIT_G, FAILED_G = 5e-5, 6.3e-5
+SLASHED = "A/1 <b>#?"
 XSS = "<img src=x onerror=window.caught=1>"
 
 
@@ -24,7 +25,7 @@ def written(folder: Path) -> list[dict[str, Any]]:
     folder.mkdir(exist_ok=True)
     found = []
     for i in range(RUNS):
-        serial = {50: RETESTED, 51: RETESTED, RUNS - 1: XSS}.get(i, f"SN-{1000 + i}")
+        serial = {50: RETESTED, 51: RETESTED, RUNS - 2: SLASHED, RUNS - 1: XSS}.get(i, f"SN-{1000 + i}")
         document = _outcome(i, FAILED.get(i, Code.WITHIN_LIMITS), serial, attempt=i - 48 if i in (50, 51) else 1)
         (folder / f"run-{i:03d}.outcome.json").write_text(to_text(document), encoding="utf-8")
         found.append(document)

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.daemon.service.page.conftest import Opened
-from tests.daemon.service.page.results import FAILED, RETESTED, RUNS, XSS, written
+from tests.daemon.service.page.results import FAILED, RETESTED, RUNS, SLASHED, XSS, written
 from tests.daemon.service.page.stage import Stage, station_file
 from triaxcald.schema.codes import Code, Verdict
 from triaxcald.service.people import People, Role, hashed
@@ -111,6 +111,13 @@ def test_a_run_without_a_recording_says_so(runs: list[dict[str, Any]], opened: O
     expect(page.get_by_text("There is no recording to draw.")).to_be_visible()
     expect(page.get_by_role("link", name="Certificate")).to_have_count(1)
     expect(page.get_by_text("Its events are no longer kept.")).to_be_visible()
+
+
+def test_a_unit_with_any_characters_in_its_serial_number_is_found(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/runs")
+    page.get_by_role("link", name=SLASHED).click()
+    expect(page.get_by_role("heading", name=f"Unit {SLASHED}")).to_be_visible()
+    expect(page.locator("tbody tr")).to_have_count(1)
 
 
 @pytest.mark.parametrize("path", ["/runs/nothing", "/units/nobody"])
