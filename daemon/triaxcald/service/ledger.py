@@ -22,6 +22,7 @@ from sqlalchemy import Connection, Engine, Select, Table, and_, delete, func, in
 
 from triaxcald.errors import InputError
 from triaxcald.outcome import SUFFIX
+from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
 from triaxcald.service import tables
 from triaxcald.service.database import (
@@ -52,6 +53,8 @@ NAMED: Final = "receiver"
 """Action in the trail: a receiver was first named."""
 TAIL: Final = 1 << 20
 """Bytes of the end of `trail.jsonl` that are compared with the trail at each start."""
+AT_MOST_US: Final = 2**63 - 1
+"""What a database can hold."""
 LOOK_MOST: Final = 200
 """Runs whose files are looked for one by one."""
 LOCK: Final = 74112
@@ -444,6 +447,44 @@ class Ledger:
         """Of this station alone."""
         return query if self._sqlite else query.where(tables.shared_run.c.home == self.home)
 
+    def in_order(self, wanted: RunFilter, size: int) -> Iterator[list[dict[str, Any]]]:
+        """All these runs in the order of time, ``size`` of them at a time, each batch
+        read when it is asked for."""
+        run = self.run
+        query = self._wanted(select(run), wanted).order_by(run.c.at_us, run.c.outcome).limit(size)
+        last: Mapping[Any, Any] | None = None
+        while True:
+            following = query
+            if last is not None:
+                later = and_(run.c.at_us == last["at_us"], run.c.outcome > last["outcome"])
+                following = query.where(or_(run.c.at_us > last["at_us"], later))
+            with self.reading() as db:
+                rows = db.execute(following).mappings().all()
+            if rows:
+                yield self._documents(rows)
+            if len(rows) < size:
+                return
+            last = rows[-1]
+
+    def columns(self, wanted: RunFilter, names: Sequence[str]) -> list[dict[str, Any]]:
+        """These columns of all these runs, in the order of time; `tables.local_run` has
+        their names. Files may be named that are not in the folder."""
+        run = self.run
+        query = self._wanted(select(*(run.c[name] for name in names)), wanted).order_by(run.c.at_us, run.c.outcome)
+        with self.reading() as db:
+            return [dict(zip(names, row, strict=True)) for row in db.execute(query)]
+
+    def first_judged(self) -> dict[str, int]:
+        """Time of the first attempt at each unit that passed or failed [µs since 1970],
+        by plain serial number."""
+        filed = tables.filed
+        query = select(filed.c.plain_serial, func.min(filed.c.at_us)).where(
+            filed.c.home == self.home, filed.c.plain_serial.is_not(None), filed.c.tried,
+            filed.c.verdict.in_((Verdict.PASS.value, Verdict.FAIL.value)),
+        )  # fmt: skip
+        with self.reading() as db:
+            return {str(serial): int(at_us) for serial, at_us in db.execute(query.group_by(filed.c.plain_serial))}
+
     # Events.
 
     def append(self, events: list[dict[str, Any]]) -> None:
@@ -695,7 +736,7 @@ def _cursor(row: Mapping[Any, Any]) -> str:
 def _place(cursor: str) -> tuple[int, str]:
     try:
         at_us, _, outcome = base64.urlsafe_b64decode(cursor.encode()).decode().partition(":")
-        if not outcome.endswith(SUFFIX):
+        if not outcome.endswith(SUFFIX) or not -AT_MOST_US <= int(at_us) <= AT_MOST_US:
             raise ValueError
         return int(at_us), outcome
     except (ValueError, binascii.Error) as e:

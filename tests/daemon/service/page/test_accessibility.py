@@ -7,7 +7,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
 from tests.daemon.service.page.conftest import Opened
-from tests.daemon.service.page.documents import documents, rows
+from tests.daemon.service.page.results import RETESTED, written
 from tests.daemon.service.page.stage import Stage, direction
 from tests.daemon.service.page.test_operator_page import ended, in_poses
 
@@ -59,10 +59,13 @@ def test_the_operators_page(stage: Stage, opened: Opened, name: str, theme: str)
 
 
 @pytest.mark.parametrize("theme", THEMES)
-@pytest.mark.parametrize("path", ["/runs", "/runs/{run}", "/units/SN-1005", "/quality", "/sign-in", "/runs/unknown"])
+@pytest.mark.parametrize(
+    "path", ["/runs", "/runs/{run}", f"/units/{RETESTED}", "/quality", "/sign-in", "/runs/unknown"]
+)
 def test_the_other_pages(stage: Stage, opened: Opened, path: str, theme: str) -> None:
-    stage.documents = documents()
-    page = opened(f"{path.format(run=rows()[5]['run'])}?theme={theme}")
+    runs = written(stage.station.parent / "out")
+    stage.ledger.take()
+    page = opened(f"{path.format(run=runs[5]['run'])}?theme={theme}")
     expect(page.locator("#content[aria-busy]")).to_have_count(0)
     page.locator("details.settings summary").click()
     assert serious(page) == []

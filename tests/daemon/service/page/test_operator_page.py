@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.daemon.service.page.conftest import Opened
-from tests.daemon.service.page.stage import Stage, direction
+from tests.daemon.service.page.stage import Stage, direction, station_file
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +27,7 @@ def task(page: Page) -> str:
     return page.locator("#task-title").inner_text()
 
 
-def card(page: Page, slot: str) -> object:
+def card(page: Page, slot: str) -> Locator:
     return page.locator(f'.card[aria-label="Slot {slot}"]')
 
 
@@ -324,6 +326,40 @@ def test_a_text_with_a_script_is_text(stage: Stage, opened: Opened) -> None:
     scan(page, XSS)
     expect(page.locator("#error-detail")).to_contain_text(XSS)
     assert page.evaluate("window.caught") is None
+
+
+@pytest.mark.parametrize("slots", ["a", "ab"])
+def test_units_without_a_common_fixture_have_poses_of_their_own(browser: Browser, tmp_path: Path, slots: str) -> None:
+    stage = Stage(station_file(tmp_path, slots, together=False))
+    stage.begin()
+    try:
+        stage.scan("OP:Olena", *SERIALS[: len(slots)], "CMD:START")
+        stage.stage("poses")
+        for slot, up in zip(slots, ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), strict=False):
+            stage.poses(slot, 2, 14, up)
+        page = browser.new_page()
+        page.goto(stage.url)
+        expect(page.locator("#task-title")).to_have_text(
+            "Lid up" if slots == "a" else "Turn each unit as its card says"
+        )
+        expect(page.locator(".card .next")).to_have_text([] if slots == "a" else ["Next: Lid up", "Next: A up"])
+        expect(page.locator(".card .turn svg")).to_have_count(0 if slots == "a" else 2)
+        page.close()
+    finally:
+        stage.end()
+
+
+def test_what_blocks_the_next_start_is_said(stage: Stage, opened: Opened) -> None:
+    stage.scan("OP:Olena", "SN-1")
+    stage.floor.stream.trouble = "the disk is full"
+    stage.scan("WO:1")
+    page = opened()
+    expect(page.locator("#task-title")).to_have_text("The next start is blocked")
+    expect(page.locator("#task-more")).to_have_text(
+        "The database does not answer. Try again. If it stays, call the engineer."
+    )
+    scan(page, "CMD:START")
+    expect(page.locator("#error-title")).to_have_text("The database does not answer.")
 
 
 def test_the_stream_alone_tells_the_state(stage: Stage, opened: Opened) -> None:

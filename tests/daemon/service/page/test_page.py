@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.daemon.service.page.results import written
 from tests.daemon.service.page.stage import Stage, station_file
 from triaxcald.service.page import FOLDER, LANGUAGES, local, preferred, static_files, words
 
@@ -103,18 +104,21 @@ def test_nothing_else_can_be_had(client: httpx.Client, path: str) -> None:
     assert answer.json()["code"] == "unknown"
 
 
-def test_who_may_not_read_is_led_to_the_sign_in_and_back(stage: Stage, client: httpx.Client) -> None:
-    stage.access.closed = True
-    try:
-        answer = client.get("/runs?order=A%26B")
-        assert answer.status_code == 303
-        assert answer.headers["location"] == "/sign-in?next=%2Fruns%3Forder%3DA%2526B"
-        assert client.get("/runs/x/trace").status_code == 401
-        page = client.get(answer.headers["location"])
-        assert page.status_code == 200
-        assert "/runs?order=A%26B" in page.text
-    finally:
-        stage.access.closed = False
+def test_who_may_not_read_is_led_to_the_sign_in_and_back(stage: Stage) -> None:
+    """Someone at another machine, who has not signed in."""
+
+    async def asked(path: str) -> httpx.Response:
+        transport = httpx.ASGITransport(stage.app, client=("192.0.2.7", 40000))
+        async with httpx.AsyncClient(transport=transport, base_url=stage.url) as client:
+            return await client.get(path)
+
+    answer = stage.do(lambda: asked("/runs?order=A%26B"))
+    assert answer.status_code == 303
+    assert answer.headers["location"] == "/sign-in?next=%2Fruns%3Forder%3DA%2526B"
+    assert stage.do(lambda: asked("/runs/x/trace")).status_code == 401
+    page = stage.do(lambda: asked(answer.headers["location"]))
+    assert page.status_code == 200
+    assert "/runs?order=A%26B" in page.text
 
 
 @pytest.mark.parametrize(
@@ -130,19 +134,15 @@ def test_the_way_back_stays_in_this_service(address: str, kept: str) -> None:
 
 def test_a_trace_has_the_readings_and_their_poses(stage: Stage, client: httpx.Client) -> None:
     folder = stage.station.parent / "out"
-    folder.mkdir(exist_ok=True)
-    (folder / "x.mcap").write_bytes((RECORDINGS / "can-second-order.mcap").read_bytes())
-    stage.book.rows = [
-        {"run": "r1", "recording": "x.mcap"},
-        {"run": "r2", "recording": None},
-        {"run": "r3", "recording": "gone.mcap"},
-    ]
-    trace = client.get("/runs/r1/trace", timeout=60).json()
+    with_recording, without = (outcome["run"] for outcome in written(folder)[:2])
+    (folder / "run-000.mcap").write_bytes((RECORDINGS / "can-second-order.mcap").read_bytes())
+    stage.ledger.take()
+    trace = client.get(f"/runs/{with_recording}/trace", timeout=60).json()
     assert trace["unit"] == "V"
     assert len(trace["poses"]) == 27
     assert len(trace["t_s"]) <= 1500
     assert [len(axis) for axis in trace["readings"]] == [len(trace["t_s"])] * 3
     assert trace["t_s"] == sorted(trace["t_s"])
     assert 2.0 < max(trace["readings"][0]) < 3.0
-    for missing in ("r2", "r3", "r4"):
+    for missing in (without, "unknown"):
         assert client.get(f"/runs/{missing}/trace").status_code == 404

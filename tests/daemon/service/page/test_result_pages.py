@@ -1,70 +1,98 @@
-"""Runs, a run, a unit and quality in a real browser."""
+"""Runs, a run, a unit and quality in a real browser, over a folder of runs."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from tests.daemon.service.page.conftest import Opened
-from tests.daemon.service.page.documents import FAILED, XSS, documents, rows
-from tests.daemon.service.page.stage import Stage
+from tests.daemon.service.page.results import FAILED, RETESTED, RUNS, SLASHED, XSS, written
+from tests.daemon.service.page.stage import Stage, station_file
+from triaxcald.schema.codes import Code, Verdict
+from triaxcald.service.people import People, Role, hashed
 
 pytestmark = pytest.mark.slow
 
 RECORDING = Path(__file__).parents[4] / "recordings" / "can-second-order.mcap"
+PIN = "4711 ä"
 
 
-@pytest.fixture(autouse=True)
-def _filled(stage: Stage) -> None:
-    stage.documents = documents()
-    stage.book.rows = rows()
+@pytest.fixture
+def runs(stage: Stage) -> list[dict[str, Any]]:
+    """The outcomes, oldest first."""
+    folder = stage.station.parent / "out"
+    found = written(folder)
+    (folder / "run-005.mcap").write_bytes(RECORDING.read_bytes())
+    for name in ("run-005.report.html", "run-006.certificate.json"):
+        (folder / name).write_text("{}", encoding="utf-8")
+    stage.ledger.take()
+    return found
 
 
-def test_the_table_of_runs_names_verdict_and_reason(opened: Opened) -> None:
+def test_the_table_of_runs_names_verdict_and_reason_page_by_page(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/runs")
-    expect(page.locator("tbody tr")).to_have_count(48)
-    row = page.locator("tbody tr", has_text="SN-1005")
+    expect(page.locator("tbody tr")).to_have_count(50)
+    page.get_by_role("link", name="Older runs").click()
+    expect(page.locator("tbody tr")).to_have_count(RUNS - 50)
+    page.get_by_role("link", name="Newest runs").click()
+    row = page.locator("tbody tr", has_text="SN-1018")
     expect(row).to_contain_text("FAIL")
     expect(row).to_contain_text("The unit’s own output is outside its limit in the check poses.")
     expect(row.locator(".outside")).to_have_text("▲ 63 µg")
-    expect(page.get_by_role("link", name="Older runs")).to_have_attribute("href", "?after=47")
+    row = page.locator("tbody tr", has_text="SN-1024")
+    expect(row).to_contain_text("STOPPED")
 
 
-def test_a_filter_goes_into_the_address_and_to_the_interface(opened: Opened) -> None:
+def test_a_filter_goes_into_the_address_and_to_the_interface(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/runs", timezone_id="Europe/Kyiv")
-    expect(page.locator("tbody tr")).to_have_count(48)
+    expect(page.locator("tbody tr")).to_have_count(50)
     page.get_by_label("Part number").fill("TX & 3")
     page.get_by_label("Verdict").select_option("fail")
-    page.get_by_label("From").fill("2026-01-20T08:00")
+    page.get_by_label("From").fill("2030-01-01T02:10")
     with page.expect_request("**/api/1/runs?*") as asked:
         page.get_by_role("button", name="Show").click()
     query = parse_qs(urlsplit(asked.value.url).query)
-    assert query == {
-        "part_number": ["TX & 3"],
-        "verdict": ["fail"],
-        "since": ["2026-01-20T06:00:00.000Z"],
-        "limit": ["50"],
-    }
-    expect(page.locator("tbody tr")).to_have_count(48)
+    wanted = {"part_number": ["TX & 3"], "verdict": ["fail"], "since": ["2030-01-01T00:10:00.000Z"]}
+    assert query == {**wanted, "limit": ["50"]}
+    failed = [i for i, code in FAILED.items() if code.verdict is Verdict.FAIL and i >= 10]
+    expect(page.locator("tbody tr")).to_have_count(len(failed))
     expect(page.get_by_label("Part number")).to_have_value("TX & 3")
-    expect(page.get_by_label("From")).to_have_value("2026-01-20T08:00")
-    csv = page.get_by_role("link", name=re.compile("CSV")).get_attribute("href")
-    assert csv is not None
-    assert parse_qs(urlsplit(csv).query) == {key: value for key, value in query.items() if key != "limit"}
+    expect(page.get_by_label("From")).to_have_value("2030-01-01T02:10")
+    with page.expect_download() as download:
+        page.get_by_role("link", name=re.compile("CSV")).click()
+    table = Path(download.value.path()).read_text(encoding="utf-8").splitlines()
+    assert len(table) == 1 + len(failed)
+    page.get_by_role("link", name="All", exact=True).click()
+    expect(page.locator("tbody tr")).to_have_count(50)
 
 
-def test_a_run_shows_figures_documents_trace_and_events(stage: Stage, opened: Opened) -> None:
-    folder = stage.station.parent / "out"
-    folder.mkdir(exist_ok=True)
-    (folder / "SN-1005.mcap").write_bytes(RECORDING.read_bytes())
-    run = rows()[5]["run"]
+def test_a_filter_that_no_run_fits_says_so(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/runs?order=none")
+    expect(page.get_by_text("No run fits this filter.")).to_be_visible()
+
+
+def test_a_run_shows_figures_documents_trace_and_events(
+    stage: Stage, runs: list[dict[str, Any]], opened: Opened
+) -> None:
+    run = runs[5]["run"]
+    head = {"format": "triaxcal.event/1", "run": run, "tray": "t", "unit": "b", "time": "2030-01-01T00:05:00.000+00:00"}
+    following = {"label": "+X", "vector": [1, 0, 0], "once_more": False}
+    stage.ledger.append([
+        {**head, "seq": 1, "event": "stage", "stage": "poses"},
+        {**head, "seq": 2, "event": "poses", "found": 1, "wanted": 14, "next": following},
+        {**head, "seq": 3, "event": "lost", "code": "lost", "reason": "no answer for 2 s"},
+        {**head, "seq": 4, "event": "back"},
+        {**head, "seq": 5, "event": "ended", "outcome": {"verdict": "fail"}},
+    ])  # fmt: skip
     page = opened(f"/runs/{run}")
     expect(page.locator(".banner .word")).to_have_text("FAIL")
-    expect(page.get_by_role("heading", name="Run of SN-1005")).to_be_visible()
+    expect(page.get_by_role("heading", name=f"Run of {RETESTED}")).to_be_visible()
     expect(page.locator("tr", has_text="Error in the check poses")).to_contain_text("▲ 63 µg")
     expect(page.locator("tr", has_text="Bias x")).to_contain_text("mg")
     for name, end in (("Report", "report"), ("Outcome (JSON)", "outcome"), ("Recording", "recording")):
@@ -72,28 +100,44 @@ def test_a_run_shows_figures_documents_trace_and_events(stage: Stage, opened: Op
     expect(page.get_by_role("link", name="Certificate")).to_have_count(0)
     expect(page.locator("figure .chart .span")).to_have_count(27, timeout=60000)
     expect(page.locator("figure .chart path")).to_have_count(3)
-    expect(page.locator("tbody tr", has_text="Unit lost: no answer for 2 s")).to_be_visible()
+    events = page.locator("section", has=page.get_by_role("heading", name="Events")).locator("tr td:last-child")
+    assert events.all_inner_texts() == [
+        "Taking poses", "Pose 1 of 14. Next: +X up", "Unit lost: no answer for 2 s", "Unit is back", "Ended: FAIL",
+    ]  # fmt: skip
 
 
-def test_a_run_without_a_recording_says_so(opened: Opened) -> None:
-    page = opened(f"/runs/{rows()[6]['run']}")
+def test_a_run_without_a_recording_says_so(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened(f"/runs/{runs[6]['run']}")
     expect(page.get_by_text("There is no recording to draw.")).to_be_visible()
+    expect(page.get_by_role("link", name="Certificate")).to_have_count(1)
+    expect(page.get_by_text("Its events are no longer kept.")).to_be_visible()
 
 
-def test_a_run_that_is_not_known_says_so(opened: Opened) -> None:
-    page = opened("/runs/nothing")
+def test_a_unit_with_any_characters_in_its_serial_number_is_found(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/runs")
+    page.get_by_role("link", name=SLASHED).click()
+    expect(page.get_by_role("heading", name=f"Unit {SLASHED}")).to_be_visible()
+    expect(page.locator("tbody tr")).to_have_count(1)
+
+
+@pytest.mark.parametrize("path", ["/runs/nothing", "/units/nobody"])
+def test_what_is_not_known_is_said(opened: Opened, path: str) -> None:
+    page = opened(path)
     expect(page.get_by_role("alert")).to_contain_text("This is not known here.")
 
 
-def test_a_unit_has_its_full_history(opened: Opened) -> None:
-    page = opened("/units/SN-1005")
+def test_a_unit_has_its_full_history(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened(f"/units/{RETESTED}")
     expect(page.locator("tbody tr")).to_have_count(3)
     assert page.locator("tbody .verdict").all_inner_texts() == ["PASS", "PASS", "FAIL"]
     expect(page.locator("figure")).to_have_count(12)
-    expect(page.locator("figure", has_text="Error in the check poses").locator(".point")).to_have_count(3)
+    checked = page.locator("figure", has_text="Error in the check poses")
+    expect(checked.locator(".point")).to_have_count(3)
+    expect(checked.locator(".point.outside")).to_have_count(1)
+    expect(checked.locator(".spec")).to_have_count(1)
 
 
-def test_a_serial_number_with_a_script_is_text_everywhere(opened: Opened) -> None:
+def test_a_serial_number_with_a_script_is_text_everywhere(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/runs")
     page.get_by_role("link", name=XSS).click()
     expect(page.get_by_role("heading", name=f"Unit {XSS}")).to_be_visible()
@@ -105,64 +149,97 @@ def test_a_serial_number_with_a_script_is_text_everywhere(opened: Opened) -> Non
     assert page.evaluate("window.caught") is None
 
 
-def test_quality_shows_yield_reasons_and_charts(opened: Opened) -> None:
+def test_quality_shows_yield_reasons_and_charts(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/quality")
-    assert page.locator(".figures dd").all_inner_texts() == ["46", "48", "87%", "93%"]
-    assert page.locator(".pareto tbody tr").count() == len(set(FAILED.values()))
-    first = page.locator(".pareto tbody tr").first
+    figures = page.locator(".figures dd")
+    expect(figures).to_have_count(4)
+    attempts = page.locator(".figures div", has_text="Attempts").locator("dd")
+    expect(attempts).to_have_text(str(RUNS))
+    expect(page.locator(".figures div", has_text="First-pass yield").locator("small")).to_contain_text("95 %:")
+    bars = page.locator(".pareto tbody tr")
+    expect(bars).to_have_count(len(set(FAILED.values())))
+    first = bars.first
     expect(first).to_contain_text("The unit’s own output is outside its limit")
+    expect(first.locator("td.n").first).to_have_text(str(list(FAILED.values()).count(Code.VERIFICATION_OUTSIDE)))
     expect(first.get_by_role("link")).to_have_attribute("href", "/runs?code=verification_outside")
+    expect(bars.last.locator("td.n").last).to_have_text("100%")
+    page.get_by_label("Control chart").select_option("verification_rms_g")
     charts = page.locator("figure")
     expect(charts).to_have_count(2)
-    expect(charts.nth(0).locator(".point.out")).to_have_count(4)
+    expect(charts.nth(0)).to_contain_text("Error in the check poses, µg: Individuals")
+    expect(charts.nth(0).locator(".point.outside")).to_have_count(3)  # a unit's last run counts, and RETESTED passed
     expect(charts.nth(0).locator(".spec")).to_have_count(1)
     expect(charts.nth(0).locator(".control")).to_have_count(2)
     page.get_by_role("button", name="Bias x").click()
     expect(charts.nth(0)).to_contain_text("Bias x, mg: Individuals")
     row = page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))
     expect(row).to_contain_text("50 µg")
+    expect(row).to_contain_text(re.compile(r"0\.\d+ \(0\.\d+–"))
     expect(page.locator("tr", has=page.get_by_role("button", name="Bias x"))).to_contain_text("no limit")
 
 
-def test_quality_gives_no_ppk_below_30_units(stage: Stage, opened: Opened) -> None:
-    few = dict(stage.documents["quality"])
-    few["characteristics"] = [c | {"n": 29, "ppk": None, "ppk_interval": None} for c in few["characteristics"]]
-    stage.documents["quality"] = few
-    page = opened("/quality")
-    expect(page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))).to_contain_text(
-        "from 30 units"
-    )
+def test_quality_gives_no_ppk_below_30_units(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/quality?slot=a")
+    row = page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))
+    expect(row).to_contain_text("from 30 units")
 
 
-@pytest.mark.parametrize("path", ["/runs", "/runs/{run}", "/units/SN-1005", "/quality", "/sign-in"])
+@pytest.mark.parametrize("path", ["/runs", "/runs/{run}", f"/units/{RETESTED}", "/quality", "/sign-in"])
 @pytest.mark.parametrize("language", ["en", "de", "uk"])
-def test_nothing_is_wider_than_a_telephone(opened: Opened, path: str, language: str) -> None:
-    page = opened(f"{path.format(run=rows()[5]['run'])}?lang={language}", viewport={"width": 400, "height": 800})
+def test_nothing_is_wider_than_a_telephone(
+    runs: list[dict[str, Any]], opened: Opened, path: str, language: str
+) -> None:
+    page = opened(f"{path.format(run=runs[5]['run'])}?lang={language}", viewport={"width": 400, "height": 800})
     expect(page.locator("#content[aria-busy]")).to_have_count(0)
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
 
 
-def test_signing_in_leads_back(stage: Stage, opened: Opened) -> None:
-    stage.access.closed = True
-    page = opened("/runs?order=4711")
-    expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
-    sent: list[object] = []
+@pytest.fixture
+def guarded(tmp_path: Path) -> Iterator[Stage]:
+    """A station that takes orders of people who have signed in alone."""
+    stage = Stage(station_file(tmp_path, open_loopback=False))
+    stage.begin()
+    people = People(stage.ledger)
+    people.add("olena", Role.OPERATOR, hashed(PIN))
+    people.add("petro", Role.READER, hashed(PIN))
+    yield stage
+    stage.end()
 
-    def answer(route: object) -> None:
-        sent.append(route.request.post_data_json)  # type: ignore[attr-defined]
-        if len(sent) == 1:
-            route.fulfill(status=401, json={"code": "not_signed_in", "message": "name or PIN is wrong"})  # type: ignore[attr-defined]
-        else:
-            stage.access.closed = False
-            route.fulfill(json={"name": "olena", "role": "operator"})  # type: ignore[attr-defined]
 
-    page.route("**/api/1/session", answer)
-    page.get_by_label("Name").fill("olena")
-    page.get_by_label("PIN").fill("1111")
-    page.get_by_role("button", name="Sign in").click()
-    expect(page.get_by_role("alert")).to_contain_text("wrong")
-    page.get_by_label("PIN").fill("2222")
+def test_an_operator_signs_in_works_and_signs_out(guarded: Stage, browser: Browser) -> None:
+    page = browser.new_context(locale="en-GB").new_page()
+    page.goto(guarded.url)
+    expect(page.locator("#task-title")).to_have_text("Scan your badge")
+    page.keyboard.type("SN-1")
     page.keyboard.press("Enter")
-    expect(page.locator("tbody tr")).to_have_count(48)
-    assert page.url.endswith("/runs?order=4711")
-    assert sent == [{"name": "olena", "pin": "1111"}, {"name": "olena", "pin": "2222"}]
+    expect(page.locator("#error")).to_contain_text("Nobody is signed in.")
+    page.locator("#error").get_by_role("link", name="Sign in").click()
+    for pin in ("1234", PIN):
+        page.get_by_label("Name").fill("olena")
+        page.get_by_label("PIN").fill(pin)
+        page.keyboard.press("Enter")
+        if pin != PIN:
+            expect(page.get_by_role("alert")).to_contain_text("wrong")
+    expect(page.locator("#task-title")).to_have_text("Scan your badge")
+    page.keyboard.type("SN-1")
+    page.keyboard.press("Enter")
+    expect(page.locator(".card.scanned")).to_have_count(1)
+    page.locator("details.settings summary").click()
+    expect(page.locator(".menu")).to_contain_text("olena, operator")
+    page.get_by_role("button", name="Sign out").click()
+    page.locator("details.settings summary").click()
+    expect(page.locator(".menu").get_by_role("link", name="Sign in")).to_be_visible()
+    page.context.close()
+
+
+def test_a_reader_is_told_what_the_role_lacks(guarded: Stage, browser: Browser) -> None:
+    page = browser.new_context(locale="uk-UA").new_page()
+    page.goto(guarded.url + "/sign-in")
+    page.locator("#name").fill("petro")
+    page.locator("#pin").fill(PIN)
+    page.keyboard.press("Enter")
+    expect(page.locator("#task-title")).to_have_text("Відскануйте перепустку")
+    page.keyboard.type("SN-1")
+    page.keyboard.press("Enter")
+    expect(page.locator("#error")).to_contain_text("Вам це не дозволено.")
+    page.context.close()

@@ -56,7 +56,8 @@ function frame({ title, width, height, below, role = "img" }, values) {
   return { picture, y, top, bottom };
 }
 
-/** A control chart: `points` [{value, label, href, out}] in their order, `lines`
+/** A control chart: `points` [{value, label, href, mark}] in their
+ * order, `mark` null, `outside` (a square) or `run` (a diamond), `lines`
  * [{value, kind}] of the kinds `centre`, `control` and `spec`. */
 export function controlChart({ title, points, lines, width, height = 240 }) {
   const shown = lines.filter((line) => line.value !== null && line.value !== undefined);
@@ -68,13 +69,17 @@ export function controlChart({ title, points, lines, width, height = 240 }) {
   const size = points.length > 120 ? 2.2 : points.length > 60 ? 3 : 4;
   for (const p of drawn) {
     const [cx, cy] = [x(p.i), y(p.value)];
-    const mark = p.out
-      ? svg("rect", { x: cx - 5, y: cy - 5, width: 10, height: 10, class: "point out" }, svg("title", {}, p.label))
-      : svg("circle", { cx, cy, r: size, class: "point" }, svg("title", {}, p.label));
+    const mark = svg("path", { d: MARKS[p.mark ?? "none"](cx, cy, size), class: `point ${p.mark ?? ""}` }, svg("title", {}, p.label));
     picture.append(p.href ? linked(p.href, p.label, mark) : mark);
   }
   return picture;
 }
+
+const MARKS = {
+  none: (x, y, r) => `M${x - r} ${y}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0`,
+  outside: (x, y) => `M${x - 5} ${y - 5}h10v10h-10Z`,
+  run: (x, y) => `M${x} ${y - 7}l7 7l-7 7l-7-7Z`,
+};
 
 function linked(href, label, mark) {
   return svg("a", { href, "aria-label": label, tabindex: "-1" }, mark);

@@ -57,30 +57,30 @@ function characteristics(list, pick) {
 }
 
 /** Individuals and moving ranges of a characteristic. */
-function charts(c) {
-  if (!c.chart || c.chart.points.length < 2) return [element("p", { class: "muted" }, word("quality.few"))];
-  const { points, individuals, moving_range } = c.chart;
-  const label = (p, value) => [p.serial, timeOf(p.time), amount(c.name, c.unit, value, 5)].filter(Boolean).join(", ");
-  const name = characteristicName(c.name);
-  const out = (value, lines) => (lines.lower !== null && value < lines.lower) || (lines.upper !== null && value > lines.upper);
-  const { factor, unit } = scaleOf(c.name, c.unit);
-  const scaled = (v) => (v === null || v === undefined ? null : v * factor);
-  const title = (kind) => `${name}${unit ? `, ${unit}` : ""}: ${word(kind)}`;
-  const linesOf = (lines, spec) => [
-    { value: scaled(lines.centre), kind: "centre" }, { value: scaled(lines.lower), kind: "control" }, { value: scaled(lines.upper), kind: "control" },
-    ...spec.map((value) => ({ value: scaled(value), kind: "spec" })),
+function charts({ name, unit: given, low, high, chart }) {
+  const { points, individuals, moving_range } = chart;
+  if (points.length < 2) return [element("p", { class: "muted" }, word("quality.few"))];
+  const { factor, unit } = scaleOf(name, given);
+  const scaled = (value) => (value === null ? null : value * factor);
+  const title = (kind) => `${characteristicName(name)}${unit ? `, ${unit}` : ""}: ${word(kind)}`;
+  const linesOf = ({ centre, lower, upper }, limits) => [
+    { value: scaled(centre), kind: "centre" },
+    ...[lower, upper].map((value) => ({ value: scaled(value), kind: "control" })),
+    ...limits.map((value) => ({ value: scaled(value), kind: "spec" })),
   ];
-  const marked = (value, p, lines) => ({
-    value: scaled(value), out: value !== null && out(value, lines), label: label(p, value), href: `/runs/${encodeURIComponent(p.run)}`,
+  const marked = (point, value, mark) => ({
+    value: scaled(value), mark, href: `/runs/${encodeURIComponent(point.run)}`,
+    label: [point.serial, timeOf(point.time), amount(name, given, value, 5)].filter(Boolean).join(", "),
   });
+  const ruled = ({ rules }) => (rules.includes("outside") ? "outside" : rules.includes("run") ? "run" : null);
+  const ranges = points.map((point, i) => (i ? Math.abs(point.value - points[i - 1].value) : null));
   return [
-    fitted(title("quality.individuals"), (given) => controlChart({
-      ...given, lines: linesOf(individuals, [c.low, c.high]),
-      points: points.map((p) => marked(p.value, p, individuals)),
+    fitted(title("quality.individuals"), (at) => controlChart({
+      ...at, lines: linesOf(individuals, [low, high]), points: points.map((point) => marked(point, point.value, ruled(point))),
     })),
-    fitted(title("quality.moving_range"), (given) => controlChart({
-      ...given, lines: linesOf(moving_range, []), height: 180,
-      points: points.map((p, i) => marked(i ? Math.abs(p.value - points[i - 1].value) : null, p, moving_range)),
+    fitted(title("quality.moving_range"), (at) => controlChart({
+      ...at, lines: linesOf(moving_range, []), height: 180,
+      points: points.map((point, i) => marked(point, ranges[i], ranges[i] > moving_range.upper ? "outside" : null)),
     })),
     element("p", { class: "muted" }, word("quality.chart_note")),
   ];

@@ -3,7 +3,7 @@
 // interface, and is shown when the stream tells of it.
 
 import { ask, clockOf, decimal, element, explained, icon, meaning, page, Refused, runLink, word, wordOr } from "./common.js";
-import { barcodePicture, cubePicture, describedPose, OWN_NAMES, spherePicture, supplyPicture } from "./pose.js";
+import { barcodePicture, cubePicture, describedPose, spherePicture, supplyPicture } from "./pose.js";
 import { atWork, Following, VERDICTS } from "./state.js";
 
 const at = (id) => document.getElementById(id);
@@ -55,7 +55,7 @@ function tasksAtWork(now, working, named) {
   const instruction = instructionOf(now, working);
   if (instruction) {
     const { pose, tilt } = describedPose(instruction.vector, page.faces);
-    const these = running.filter((s) => instruction.slots.includes(s.slot));
+    const these = running.filter((s) => COLLECTING.includes(s.stage) && instruction.slots.includes(s.slot));
     const once_more = these.length > 0 && these.every((s) => s.next?.once_more);
     tasks.push({
       title: pose, tilt, up: instruction.vector, slots: named(these), tone: "act",
@@ -168,6 +168,9 @@ function showCards(now) {
   holder.dataset.slots = nodes.length > 6 ? "many" : nodes.length > 2 ? "some" : "few";
 }
 
+/** Whether each unit has a pose of its own to take: several, and no fixture. */
+const turnedAlone = () => !page.together && page.slots.length > 1;
+
 function showCard(node, slot) {
   const verdict = VERDICTS[slot.state];
   node.className = `card ${slot.state}`;
@@ -195,12 +198,15 @@ function showCard(node, slot) {
       told.append(element("p", { class: "count" }, word(key, { found: slot.found, wanted: slot.wanted })),
         element("progress", { max: slot.wanted, value: Math.min(slot.found, slot.wanted), "aria-label": word("card.poses") }));
     }
-    if (slot.next && !page.together) {
-      const { pose, tilt } = describedPose(slot.next.vector, OWN_NAMES);
-      told.append(element("p", { class: "next" }, `${word("card.next")}: ${[pose, tilt].filter(Boolean).join(", ")}`));
+    if (slot.next && turnedAlone()) {
+      const { pose, tilt } = describedPose(slot.next.vector, page.faces);
+      const said = [pose, tilt].filter(Boolean).join(", ");
+      told.append(element("p", { class: "next" }, `${word("card.next")}: ${said}`));
+      body.append(element("div", { class: "turn" }, cubePicture(slot.next.vector, page.faces, word("pose.drawing", { pose: said }))));
     }
     if (slot.state === "running") told.append(element("div", { class: "still", hidden: true }, element("div", { class: "bar" }, element("i")), element("span")));
-    body.append(told, element("div", { class: "ball" }));
+    body.prepend(told);
+    body.append(element("div", { class: "ball" }));
   } else body.append(told);
   node.replaceChildren(head, body);
   showLive(slot);

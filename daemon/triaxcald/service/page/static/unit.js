@@ -14,7 +14,7 @@ function overRuns(runs, { name, title, unit, limit }) {
     value: run[name] * scale.factor,
     label: `${timeOf(run.ended)}: ${amount(name, unit, run[name], 5)}`,
     href: `/runs/${encodeURIComponent(run.run)}`,
-    out: known(run[limit]) && run[name] > run[limit],
+    mark: known(run[limit]) && run[name] > run[limit] ? "outside" : null,
   }));
   if (points.length < 2) return null;
   const limits = runs.map((run) => run[limit]).filter(known);
