@@ -207,6 +207,8 @@ class Ledger:
         with answering():
             known = inspect(engine).has_table("alembic_version")
         migrate(engine)
+        with answering(), engine.begin() as db:  # gone where the index was made anew
+            db.exec_driver_sql("CREATE INDEX IF NOT EXISTS run_at ON run (at_us, outcome)")
         before = self._join_trail(engine)
         if not known and (before or suspect):
             self.lost = (
@@ -405,7 +407,9 @@ class Ledger:
     def run_of(self, run_id: str) -> dict[str, Any] | None:
         """The run of that id."""
         with self.reading() as db:
-            query = self._here(select(self.run)).where(self.run.c.run == run_id).order_by(self.run.c.outcome)
+            filed = tables.filed
+            of_run = select(filed.c.outcome).where(filed.c.home == self.home, filed.c.run == run_id)
+            query = self._here(select(self.run)).where(self.run.c.outcome.in_(of_run)).order_by(self.run.c.outcome)
             rows = db.execute(query.limit(1)).mappings().all()
         return next(iter(self._documents(rows)), None)
 

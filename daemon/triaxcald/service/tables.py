@@ -71,8 +71,8 @@ filed: Final = Table(
     Column("outcome_sha256", Text, nullable=False),
     Column("run", Text),
     Column("serial", Text),
-    Column("plain_serial", Text, index=True),
-    Column("plain_reported", Text, index=True),
+    Column("plain_serial", Text),
+    Column("plain_reported", Text),
     Column("at_us", BigInteger, nullable=False),
     Column("ended_us", BigInteger, nullable=False),
     Column("tried", Boolean, nullable=False),
@@ -82,6 +82,12 @@ filed: Final = Table(
 )  # fmt: skip
 """Outcomes from which rows of the other tables are made. ``serial`` is the expected
 serial number, else the reported one, which ``plain_reported`` is of."""
+
+# All of a file's rows have one home: an index that begins with it has to be better than
+# any other.
+Index("filed_serial", filed.c.home, filed.c.plain_serial, filed.c.ended_us, filed.c.outcome)
+Index("filed_reported", filed.c.home, filed.c.plain_reported, filed.c.outcome)
+Index("filed_run", filed.c.home, filed.c.run, filed.c.outcome)
 
 unit: Final = Table(
     "unit", metadata,
@@ -112,6 +118,8 @@ measurement: Final = Table(
     Column("passed", Boolean),
     PrimaryKeyConstraint("home", "outcome", "name"),
 )  # fmt: skip
+
+Index("measurement_run", measurement.c.home, measurement.c.run, measurement.c.outcome)
 
 person: Final = Table(
     "person", metadata,
@@ -172,17 +180,23 @@ outbox: Final = Table(
 )  # fmt: skip
 """``state`` is `waiting`, `delivered` or `refused`; ``added_us`` and ``ended_us`` are
 the times of entry and end, ``error`` is of the last try."""
+Index("outbox_run", outbox.c.home, outbox.c.run, outbox.c.receiver)
+_failed: Final = outbox.c.error.is_not(None)
+Index(
+    "outbox_error", outbox.c.home, outbox.c.receiver, outbox.c.id, sqlite_where=_failed, postgresql_where=_failed
+)  # fmt: skip
 Index("outbox_waiting", outbox.c.home, outbox.c.receiver, outbox.c.state, outbox.c.id)
 
 event: Final = Table(
     "event", metadata,
     Column("home", Text, nullable=False),
     Column("seq", BigInteger, nullable=False),
-    Column("run", Text, index=True),
+    Column("run", Text),
     Column("event", Text, nullable=False),
     PrimaryKeyConstraint("home", "seq"),
 )  # fmt: skip
 """``event`` is a `triaxcal.event/1`."""
+Index("event_run", event.c.home, event.c.run, event.c.seq)
 
 setting: Final = Table(
     "setting", metadata,

@@ -170,8 +170,7 @@ class Database:
             with closing(_connected(self.path)) as db:
                 if self._present_inode() is None or not has_service(db):
                     return False
-                if db.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
-                    return False
+                check(db)
                 with transaction(db):
                     for table in TABLES:
                         db.execute(f"DROP TABLE IF EXISTS {table}")
@@ -209,6 +208,13 @@ def transaction(db: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
+def check(db: sqlite3.Connection, of: str = "1") -> None:
+    """The whole file, or one table of it with its indexes. Raises
+    sqlite3.DatabaseError."""
+    if (told := db.execute(f"PRAGMA integrity_check({of})").fetchone()[0]) != "ok":
+        raise sqlite3.DatabaseError(told)
+
+
 def has_service(db: sqlite3.Connection) -> bool:
     """Whether a service has tables in the file."""
     query = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
@@ -222,13 +228,15 @@ def _connected(path: Path | str) -> sqlite3.Connection:
 
 
 def _prepare(db: sqlite3.Connection) -> None:
-    """Bring the tables to the present version. Raises sqlite3.Error, _NotOurs for the
-    file of a later version."""
+    """Bring the tables to the present version. A file with tables of a service, which
+    are many times larger, is not checked as a whole. Raises sqlite3.Error, _NotOurs
+    for the file of a later version."""
     version = _version(db)
     if version > len(MIGRATIONS):
         raise _NotOurs
-    if version and (told := db.execute("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
-        raise sqlite3.DatabaseError(told)
+    if version:
+        for table in TABLES if has_service(db) else ("1",):
+            check(db, table)
     if version == len(MIGRATIONS):
         return
     with transaction(db):

@@ -21,7 +21,7 @@ from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
-from triaxcald.store.database import OWN, TIMES, Database, has_service, transaction
+from triaxcald.store.database import OWN, TIMES, Database, check, has_service, transaction
 from triaxcald.store.rows import BESIDE, Cell, NoOutcome, cells_of
 
 BATCH = 500
@@ -169,9 +169,9 @@ class Store:
 
     def make(self) -> bool:
         """Make the file of the index, also in a folder without an outcome, and check
-        it. False where there can be none, and the index is in memory."""
+        the whole of it. False where there can be none, and the index is in memory."""
         with self._lock:
-            self._database.on(lambda _: None)
+            self._database.on(check)
             return not self._database.in_memory
 
     def has_service(self) -> bool:

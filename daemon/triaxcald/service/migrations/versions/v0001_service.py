@@ -19,8 +19,6 @@ def upgrade() -> None:
     postgresql = connection.dialect.name == "postgresql"
     if postgresql:
         tables.shared_run.create(connection)
-    else:
-        op.execute("CREATE INDEX IF NOT EXISTS run_at ON run (at_us, outcome)")
     for name in TABLES:
         tables.metadata.tables[name].create(connection)
     for statement in POSTGRESQL if postgresql else SQLITE:
