@@ -301,6 +301,43 @@ def test_a_service_that_hangs_greys_the_page_within_5_s(stage: Stage, opened: Op
     expect(page.locator("#stop")).to_be_enabled()
 
 
+def test_a_page_without_a_network_catches_up(stage: Stage, opened: Opened) -> None:
+    """As on a tablet that slept, or lost its wireless network."""
+    in_poses(stage)
+    page = opened()
+    expect(page.locator("#task-title")).to_have_text("Edge A/Lid up")
+    page.context.set_offline(True)
+    page.evaluate("window.stop()")  # ends the connections that are open
+    expect(page.locator("#stale")).to_be_visible(timeout=8000)
+    for slot in "abc":
+        stage.finish(slot)
+    stage.poses("d", 9)
+    page.context.set_offline(False)
+    expect(page.locator(".card.passed")).to_have_count(3)
+    expect(card(page, "d")).to_contain_text("Pose 9 of 14")
+    expect(page.locator("#stale")).to_be_hidden()
+
+
+def test_a_session_that_has_ended_leads_to_the_sign_in(opened: Opened) -> None:
+    page = opened()
+    expect(page.locator("#task-title")).to_have_text("Scan your badge")
+    answer = {"code": "not_signed_in", "message": "sign in as reader"}
+    page.route("**/api/1/events*", lambda route: route.fulfill(status=401, json=answer))
+    page.route("**/api/1/station", lambda route: route.fulfill(status=401, json=answer))
+    page.evaluate("window.stop()")
+    page.wait_for_url("**/sign-in?next=%2F")
+
+
+def test_other_slots_in_the_station_file_reach_the_page(stage: Stage, opened: Opened) -> None:
+    page = opened()
+    expect(page.locator(".card")).to_have_count(4)
+    station_file(stage.station.parent, "pq")
+    with page.expect_navigation():
+        stage.do(stage.floor.reload)
+    expect(page.locator(".card")).to_have_count(2)
+    assert '"slots": ["p", "q"]' in (page.locator("body").get_attribute("data-page") or "")
+
+
 def test_a_restarted_service_is_found_again_and_nothing_scanned_is_lost(stage: Stage, opened: Opened) -> None:
     stage.scan("OP:Olena", "WO:4711", *SERIALS[:2])
     page = opened()
@@ -366,6 +403,7 @@ def test_the_stream_alone_tells_the_state(stage: Stage, opened: Opened) -> None:
     """No request asks for it, and events between two states lead to what the service has."""
     asked: list[str] = []
     page = opened()
+    expect(page.locator(".card.empty")).to_have_count(4)
     page.on("request", lambda request: asked.append(request.url))
     in_poses(stage)
     stage.say("lost", "b", code="lost", reason="no answer for 2 s")
