@@ -16,6 +16,13 @@ from typing import BinaryIO
 from triaxcald.abort import at_abort
 from triaxcald.errors import InputError, RecordingError
 
+_OF_THE_DISK = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS))
+
+
+def is_of_the_disk(e: OSError) -> bool:
+    """Whether the disk is full, fails, or takes no data."""
+    return e.errno in _OF_THE_DISK
+
 
 def require_recording(path: Path) -> None:
     """Raises RecordingError where no command would read a recording of that
@@ -91,6 +98,17 @@ def write_durably(path: Path, text: str) -> None:
     of power. Raises OSError."""
     replace_bytes(path, text.encode())
     synchronise(path.parent)
+
+
+def overwrite(path: Path, offset: int, data: bytes) -> None:
+    """Bytes within a file, on the disk when it returns. They need no new room, so a
+    full disk takes them too. Raises OSError."""
+    flags = os.O_WRONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    with open(os.open(path, flags), "wb") as file:
+        file.seek(offset)
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def synchronise(folder: Path) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import triaxcal as tc
 from triaxcald.provision.state import DeviceState, Evidence, Held
-from triaxcald.schema.codes import Stage, Verdict
+from triaxcald.schema.codes import Code, Stage, Verdict
 
 if TYPE_CHECKING:
     from triaxcald.provision.procedure import Provisioning
@@ -185,13 +185,15 @@ KILLED = "the process was killed"
 
 
 def killed(slot: str, started: str, path: Path, outcome: Mapping[str, Any], station: Path) -> str:
-    """Of a run that ended without an outcome, which the next start has written."""
+    """Of a run that ended without an outcome in its recording, which the next start
+    has written."""
     journal, device = outcome["journal"], ""
     if journal is not None:
         device = f"; {unfinished(Path(journal), slot, station)}"
     elif outcome["device_state"] == DeviceState.UNTOUCHED:
         device = "; no register was written"
-    return f"unit {slot}: the run of {started} was killed; its outcome is {path}{device}"
+    how = "was killed" if outcome["code"] == Code.KILLED else f"could not be stored ({outcome['reason']})"
+    return f"unit {slot}: the run of {started} {how}; its outcome is {path}{device}"
 
 
 def switch_supply(off_s: float) -> str:

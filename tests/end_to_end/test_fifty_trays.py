@@ -487,7 +487,6 @@ def test_every_attempt_of_fifty_trays_leaves_one_outcome_with_its_code(
     print(Counter(d["code"] for d in outcomes))
 
 
-@pytest.mark.xfail(strict=True, reason="nothing mends the recording that a failing disk has cut short")
 def test_a_disk_that_fails_in_a_recording_leaves_a_folder_that_can_be_audited(
     workshop: Any, triaxcal: Run, start: Callable[..., Any]
 ) -> None:

@@ -29,7 +29,7 @@ from triaxcald.audit.results import (
     held_in,
     outcome_again,
     report_of,
-    was_killed,
+    sealed_later,
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.computer import KEYS, computer
@@ -219,7 +219,7 @@ class _Audit:
         state = held_in(held)
         if state is None:
             self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
-        elif _needs_journal(state, held.get("registers")) not in (held.get("journal") is not None, None):
+        elif not self._has_its_journal(state):
             wanted = "a path" if held.get("journal") is None else None
             self._add(ATTACHMENT, Kind.VALUE, "journal", stored=held.get("journal"), again=wanted)
         if self._aborted and state is not None and _owes_device(state, held) and held.get("exit_code") != DEVICE:
@@ -240,6 +240,16 @@ class _Audit:
         if not told and self._made_by is None and contents_again == held.get("contents") and data != again_data:
             told = [Difference(ATTACHMENT, Kind.BYTES)]
         self._differences += told
+
+    def _has_its_journal(self, state: Held) -> bool:
+        """Whether the outcome names a journal where one is needed, and only there."""
+        needed, named = _needs_journal(state, self._outcome.get("registers")), self._outcome.get("journal") is not None
+        # Without the registers, nothing tells that an undoing has failed.
+        return needed in (named, None) or (named and self._sealed_later)
+
+    @property
+    def _sealed_later(self) -> bool:
+        return sealed_later(self._outcome, self._recording)
 
     def _papers(self, again: Again) -> dict[str, str]:
         """Digests of the papers that the line leaves: computed again where they
@@ -336,7 +346,7 @@ class _Audit:
             aborted=self._aborted,
             provisioned=self._check_events(again),
             rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
-            killed=was_killed(self._outcome),
+            cut_short=self._sealed_later,
         )
         if again.written and not self._aborted and self._outcome and said.told is None:
             self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")
@@ -366,8 +376,8 @@ class _Audit:
             self._add(EVENTS, Kind.MISSING, "provisioned")
         if self._outcome:
             reason = self._outcome.get("reason") if self._aborted else None
-            # A killed process may have told another reason, or none.
-            if failed != reason and not was_killed(self._outcome):
+            # A recording that was cut short may tell another reason, or none.
+            if failed != reason and not self._sealed_later:
                 self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)
             state = self._outcome.get("device_state")
             undone = self._outcome.get("verdict") == Verdict.FAIL.value and again.written

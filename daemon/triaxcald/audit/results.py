@@ -33,7 +33,7 @@ from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import STATION_FILE, RawDigest
+from triaxcald.recording.schema import RECOVERY_RECORD, SEALED_LATER, STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.write_back import VERIFICATION_FILE
@@ -274,9 +274,13 @@ def report_of(again: Again, ending: Ending, held: Held) -> str:
     return unit_report(again.certified, again.readings, ending, again.verification if again.checked else None, held)
 
 
-def was_killed(outcome: Mapping[str, Any]) -> bool:
-    """Whether the next start wrote the outcome, which then has no figures."""
-    return outcome.get("code") == Code.KILLED
+def sealed_later(outcome: Mapping[str, Any], recording: Recording) -> bool:
+    """Whether the next start sealed the recording, which ends before the run did. The
+    outcome then has no figures."""
+    if outcome.get("verdict") != Verdict.ABORTED.value:
+        return False
+    recovered = recording.metadata.get(RECOVERY_RECORD, {})
+    return outcome.get("code") == Code.KILLED or recovered.get(SEALED_LATER) == ATTACHMENT
 
 
 def outcome_again(
@@ -310,7 +314,7 @@ def outcome_again(
         held_in(stored) or Held(),
         Papers(
             measured=measured_in(certificate) if certificate else None,
-            verification=again.verification if checked and not was_killed(stored) else None,
+            verification=again.verification if checked and not sealed_later(stored, recording) else None,
             registers=RegistersDone.read(stored.get("registers")),
             limits=again.station.limits.model_dump(),
             outside=certificate["outside"] if certificate else (),

@@ -153,8 +153,9 @@ class Said:
     """The registers that were written, by the event; None where there is no
     such event."""
     rules: Rules = Rules.MARK_OR_SUPPLY
-    killed: bool = False
-    """A killed process told nothing of what it wrote."""
+    cut_short: bool = False
+    """The recording ends before the run did, and the outcome tells nothing of what was
+    written."""
 
     @property
     def old(self) -> Raw | None:
@@ -229,7 +230,7 @@ def _after(traffic: Traffic, said: Said) -> list[Difference]:
         for name, raw in said.new.items()
         if said.after.get(name) != raw
     ]
-    if said.provisioned is None and not said.killed:
+    if said.provisioned is None and not said.cut_short:
         found.append(Difference(REGISTERS, Kind.NOT_SHOWN, "provisioned", REGISTERS_AFTER))
     if found or any(s.raw == said.after for s in traffic.snapshots):
         return found
@@ -256,7 +257,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
     image = said.new
     seen = list(dict.fromkeys(a.register for _, a in traffic.writes if a.raw == image.get(a.register)))
     if written is None:
-        return [] if said.killed else [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
+        return [] if said.cut_short else [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
     # A stop may come between a request and its record; an undoing may write
     # what is old and new alike.
     cut = said.aborted and seen == list(written[:-1])
@@ -290,6 +291,10 @@ def _state(traffic: Traffic, said: Said) -> list[Difference]:
     """Whether the traffic bears out what the device is said to hold."""
     if said.held is None:
         return []
+    if said.cut_short:  # what came after it may show any state, but for one
+        untouched = said.held.state is DeviceState.UNTOUCHED
+        wrong = untouched and bool(traffic.writes)
+        return [Difference(ATTACHMENT, Kind.NOT_SHOWN, "device_state", said.held.state.value)] if wrong else []
     shown = _SHOWN[said.held.state](traffic, said)
     proof = _PROVEN.get(said.held.evidence)
     proven = said.held.evidence in _GOES_WITH[said.held.state] and (proof is None or proof(traffic, said))

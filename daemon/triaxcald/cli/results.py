@@ -10,12 +10,13 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
+import triaxcal_drivers as td
 from triaxcald.cli.console import erased, micro, say, show, table
 from triaxcald.cli.syntax import writable
 from triaxcald.errors import InputError
@@ -48,6 +49,10 @@ def results_command(a: argparse.Namespace) -> int:
     until_us = None if a.until is None else _moment("--until", a.until, days=1)
     if since_us is not None and until_us is not None and since_us >= until_us:
         raise InputError(f"--since: expected a time before --until {a.until}, not '{a.since}'")
+    if a.database is not None and not a.rebuild:
+        raise InputError("--database: give --rebuild with it")
+    if a.rebuild:
+        _rebuild(a.folder, a.database)
     runs = _runs(a.folder, since_us=since_us, until_us=until_us, serial=a.serial, code=a.code)
     if a.output is not None:
         _write(a.output, runs)
@@ -76,10 +81,42 @@ def _moment(option: str, text: str, days: int = 0) -> int:
         raise InputError(f"{option}: {expected}, not '{text}'") from None
 
 
-def _runs(folder: Path, **wanted: Any) -> Runs:
-    """Raises InputError where the folder cannot be read."""
+def _rebuild(folder: Path, database: str | None) -> None:
+    """Make the index anew, and the rows of a service where there is one. Raises
+    InputError, StationError."""
+    _require_folder(folder)
+    try:
+        with Store(folder) as store:
+            store.forget()
+            rows = store.runs().rows
+            served = store.has_service()
+    except OSError as e:
+        raise InputError(f"{folder}: cannot be read: {e.strerror}") from e
+    if not rows and database is not None:
+        raise InputError(f"{folder}: no outcome says which station's rows these are")
+    if not served and database is None:
+        return
+    if hint := td.hints.absent(("sqlalchemy", "alembic")):
+        if database is not None:
+            raise InputError(f"--database: {hint}")
+        say(f"{folder}: the rows of units and measurements stay as they are: {hint}")
+        return
+    from triaxcald.service.ledger import Ledger
+
+    station = str(rows[-1][NAMES.index("station")]) if rows else ""
+    with closing(Ledger.of_folder(folder, station, database)) as ledger:
+        ledger.rebuild()
+
+
+def _require_folder(folder: Path) -> None:
+    """Raises InputError."""
     if not folder.is_dir():
         raise InputError(f"{folder}: {'not a folder' if folder.exists() else 'there is no such folder'}")
+
+
+def _runs(folder: Path, **wanted: Any) -> Runs:
+    """Raises InputError where the folder cannot be read."""
+    _require_folder(folder)
     try:
         with Store(folder) as store:
             return store.runs(**wanted)

@@ -355,9 +355,9 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("devices", metavar="DEVICE.toml", type=Path, nargs="+")
     p.add_argument(
-        "--follow", metavar="FILE|-",
+        "--follow", metavar="FILE|-|URL",
         help="turn the units and switch their supplies as the events of `run --events` say, from a file that grows, a "
-        "FIFO, or standard input",
+        "FIFO, standard input, or a station's service (http://…)",
     )  # fmt: skip
     p = _command(
         commands, "record", "record:record_command", "record only",
@@ -400,6 +400,15 @@ def _line(commands: Any) -> None:
     p.add_argument("--until", metavar="TIME", help="runs that began before this time, or on or before this date")
     p.add_argument("--serial", help="runs of this serial number, reported or expected")
     p.add_argument("--code", type=_code, metavar="CODE", help="runs that ended with this code, as fit_outside")
+    p.add_argument(
+        "--rebuild", action="store_true",
+        help="read all outcomes anew, and make the rows of the database from them",
+    )  # fmt: skip
+    p.add_argument(
+        "--database",
+        metavar="URL",
+        help="with --rebuild: rows of the station in PostgreSQL, postgresql://USER@HOST/NAME",
+    )
     p.add_argument("-o", "--output", type=Path, metavar="TABLE", help=".csv, .csv.gz or .parquet")
     add_json(p)
 
@@ -733,7 +742,7 @@ def _access(commands: Any) -> None:
 
 
 def _add_database(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True)
+    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True, help="whose service it is")
     p.add_argument(
         "--database", metavar="URL",
         help="of PostgreSQL, as for serve; default: triaxcal.sqlite in the station's folder",

@@ -94,6 +94,8 @@ class RegisterLink:
         self.probed: list[str] = []
         """Registers written by the restart check, one entry a write: a probe, or the
         register's own value again."""
+        self.before_probe: Callable[[], None] = lambda: None
+        """Called before the restart check writes. Raises DiskError."""
 
     async def open(self) -> None:
         try:

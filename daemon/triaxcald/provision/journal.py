@@ -1,5 +1,5 @@
 """The journal of a provisioning: its old and wanted registers, on disk from before
-the first write until the state of the device is settled."""
+the first write, a probe too, until the state of the device is settled."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from triaxcald.provision.registers import (
 )
 
 FORMAT, FOLDER = "triaxcal.journal/1", "journal"
-Step = Literal["writing", "storing", "stored", "unverified"]
-"""``unverified``: the provisioning ended, but no restart has proven the stored
-values."""
+Step = Literal["probing", "writing", "storing", "stored", "unverified"]
+"""``probing``: nothing is written but the probe of a restart check. ``unverified``: the
+provisioning ended, but no restart has proven the stored values."""
 
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")

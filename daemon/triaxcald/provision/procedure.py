@@ -193,6 +193,8 @@ class Provisioning:
     _restarted: bool = False
     """Whether a restart was proven before the first reading of the registers."""
     _journaled: bool = False
+    _probing: bool = False
+    """Whether the journal is there for a probe alone."""
     _earlier: list[Journal] = field(default_factory=list)
     """Journals of this unit that earlier provisionings left, the newest first."""
     _unlocked: bool = False
@@ -270,7 +272,8 @@ class Provisioning:
         entry = self._entry_of_this_unit(journals)
         if entry is not None:
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
-            self._store_owed = self.stores and entry.step not in ("stored", "unverified") and not self._restarted
+            stored = entry.step in ("probing", "stored", "unverified")
+            self._store_owed = self.stores and not stored and not self._restarted
             if self.found.differing(entry.wanted) and self.found.differing(entry.before):
                 self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
         else:
@@ -311,14 +314,21 @@ class Provisioning:
 
     def _named_for_it(self, journals: list[tuple[Journal, Entry]]) -> list[Journal]:
         """Journals with the product and the serial number of this unit. A journal of
-        an earlier version has the digest of the profile in place of the product."""
+        an earlier version has the digest of the profile in place of the product.
+        Without a serial number, a probe is of this unit if its registers are."""
         mine = self.bundle.digest()
-        return [j for j, e in journals if e.serial is not None and (e.product or e.profile_sha256 == mine)]
+        return [
+            j
+            for j, e in journals
+            if (e.serial is not None and (e.product or e.profile_sha256 == mine))
+            or (e.step == "probing" and not self.found.differing(e.before))
+        ]
 
     async def identify(self) -> None:
         """Identify the unit, and check that no other one answers. Raises WrongUnit,
         TwoAnswer, DriverError."""
         self.steps.append("identity")
+        self.link.before_probe = self._before_probe
         self.identity = await identified(self.link, self.bundle, self.expected_serial, where=self.where)
         self.link.watch()
         self.owner = Owner.of(self.bundle.profile, self.unit, self.identity.serial)
@@ -425,7 +435,10 @@ class Provisioning:
             self.on_settled(self.held)
             for journal in (*self._earlier, *([self.journal] if self._journaled else [])):
                 journal.remove()
-            self._earlier, self._journaled = [], False
+            self._earlier, self._journaled, self._probing = [], False, False
+        elif self._probing and not self.link.touched & set(self.before.raw):  # the probe is gone
+            self.journal.remove()
+            self._journaled = self._probing = False
         elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
             self._note("unverified")
 
@@ -698,8 +711,14 @@ class Provisioning:
                 f"register {name} holds {self.after.raw[name].hex()}, expected {self.image.raw[name].hex()}"
             )
 
+    def _before_probe(self) -> None:
+        """The journal is on disk before the first probe, which stands in no register
+        image. Raises DiskError."""
+        if self.examined and not (self._journaled or self._earlier):
+            self._note("probing")
+
     def _note(self, step: Step) -> None:
-        self._journaled = True
+        self._journaled, self._probing = True, step == "probing"
         self.journal.write(
             Entry(
                 unit=self.unit,

@@ -69,7 +69,8 @@ async def checked_restart(
     ``known`` are register images, one of which is stored: no probe equals them. No
     register gets a probe if writes last without a store, or if the device refuses
     the values. Raises ProvisionError if the register does not take its value back;
-    WrongUnit; RegisterRefused, other DriverError or SequenceStalled of the restart.
+    WrongUnit; DiskError of the journal; RegisterRefused, other DriverError or
+    SequenceStalled of the restart.
     """
     touched = set(link.touched)
     probe: _Probe | None = None
@@ -197,8 +198,9 @@ def neighbouring_values(profile: td.Profile, name: str, raw: bytes) -> list[byte
 async def _put(link: RegisterLink, bundle: td.Bundle, serial: str | None, name: str, raw: bytes) -> bool:
     """Write a value in use; whether the register read it back.
 
-    Raises WrongUnit, with nothing written; RegisterRefused of the write.
+    Raises WrongUnit, DiskError, with nothing written; RegisterRefused of the write.
     """
+    link.before_probe()
     try:
         await check_identity(link, bundle, serial)
         await run_sequence(link, bundle, "unlock")

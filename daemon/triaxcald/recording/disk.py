@@ -10,11 +10,11 @@ from pathlib import Path
 
 from triaxcald import memory
 from triaxcald.errors import DiskError, RecordingError
+from triaxcald.files import is_of_the_disk
 
 END_BYTES, CHUNK_BYTES = 4 * 2**20, 256
 """So much room the end of a file takes at most, and more for each of its chunks:
 the last chunk is of a mebibyte or two, and each has its index."""
-_OF_THE_DISK = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS))
 
 
 def free_bytes(path: Path | int) -> int | None:
@@ -39,7 +39,7 @@ def require_there(descriptor: int) -> None:
 
 
 def not_created(path: Path, e: OSError) -> RecordingError:
-    kind = DiskError if e.errno in _OF_THE_DISK else RecordingError
+    kind = DiskError if is_of_the_disk(e) else RecordingError
     return kind(f"{path}: cannot be created: {e.strerror}")
 
 

@@ -18,8 +18,8 @@ from mcap.writer import Writer as McapWriter
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.errors import RecordingError
-from triaxcald.files import exists_already, new_file
+from triaxcald.errors import DiskError, RecordingError
+from triaxcald.files import exists_already, is_of_the_disk, new_file
 from triaxcald.recording import schema
 from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.mcap_records import (
@@ -228,12 +228,14 @@ class Recovery:
 
 
 class Sealed(NamedTuple):
-    """The document that a mended recording ends with, as its last attachment."""
+    """The document that a mended recording ends with, as its last attachment.
+    ``later``: it was not in the recording, which ends before the run did."""
 
     name: str
     media_type: str
     time_ns: int
     data: bytes
+    later: bool = False
 
 
 def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sealed | None = None) -> Recovery:
@@ -242,8 +244,9 @@ def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sea
     ``out``.
 
     Raises RecordingError if ``path`` is no recording of triaxcal or cannot be read,
-    or if ``out`` exists or cannot be written. Raises Refused if ``path`` has neither
-    a whole message nor an attachment. An error leaves no ``out`` behind.
+    or if ``out`` exists or cannot be written; DiskError if the disk fails. Raises
+    Refused if ``path`` has neither a whole message nor an attachment. An error leaves
+    no ``out`` behind.
     """
     if is_manifest(path):
         raise RecordingError(f"{path}: is a manifest; mend each segment that it says is cut short or damaged")
@@ -254,7 +257,8 @@ def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sea
     except FileExistsError:
         raise exists_already(out) from None
     except OSError as e:
-        raise RecordingError(f"{e.filename or out}: {e.strerror}") from e
+        kind = DiskError if is_of_the_disk(e) else RecordingError
+        raise kind(f"{e.filename or out}: {e.strerror}") from e
 
 
 def _write(damaged: DamagedFile, name: str, out: Path, without: Collection[str], sealed: Sealed | None) -> Recovery:
@@ -447,5 +451,7 @@ class _Recoverer:
         summary = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
         if "sha256" in self._written:
             summary["sha256_when_written"] = self._written["sha256"]
+        if self._sealed is not None and self._sealed.later:
+            summary[schema.SEALED_LATER] = self._sealed.name
         self._mcap.add_metadata(schema.RECOVERY_RECORD, summary)
         self._mcap.finish()  # type: ignore[no-untyped-call]

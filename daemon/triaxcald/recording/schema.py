@@ -32,6 +32,7 @@ RAW_RECORD = "raw"  # the metadata record with count and digest, written at the 
 END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
 IMPORTED = "imported"  # the kind of the event about the log that a recording was imported from
 RECOVERY_RECORD = "recovery"  # the metadata record of a recovered recording
+SEALED_LATER = "sealed_later"  # its key with the name of a document that was not in the recording
 BUS_RECORD = "bus"  # the metadata record of a recording of all frames of a bus, in place of `unit`
 SEGMENT_RECORD = "segment"  # the metadata record with the place of a segment in its recording
 UNCONFIRMED = "unconfirmed"  # the metadata record, and event, about records of an unknown sender

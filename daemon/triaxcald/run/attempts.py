@@ -4,10 +4,12 @@ A file in the station's folder stands for each attempt that is under way. It say
 an outcome needs, and is removed once the outcome is on the disk. The process holds a
 lock on a file of its tray. The next start in the folder takes each attempt whose tray
 nobody holds for one that was killed, repairs its recording and writes its outcome.
+So it does where the disk failed: the file then has the outcome that the run ended with.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -22,7 +24,7 @@ import triaxcal as tc
 from triaxcald import text
 from triaxcald.documents import to_text
 from triaxcald.errors import DiskError, InputError, RecordingError
-from triaxcald.files import synchronise, write_durably, write_new, write_text
+from triaxcald.files import is_of_the_disk, overwrite, synchronise, write_durably, write_new, write_text
 from triaxcald.outcome import (
     ATTACHMENT,
     CERTIFICATE,
@@ -51,6 +53,9 @@ FOLDER: Final = "running"
 FORMAT: Final = "triaxcal.attempt/1"
 DAMAGED: Final = ".mcap.damaged"
 """Suffix of what a killed process left, where mending it loses something."""
+ROOM: Final = 16384
+"""Bytes of an attempt's file: one line for the attempt, and room for its outcome, which
+an outcome without figures fills to a fifth."""
 PAPERS: Final = (CERTIFICATE, REPORT)
 """Attachments that state an ending, which a killed run did not reach."""
 
@@ -60,7 +65,7 @@ class AttemptFile:
     """The file of an attempt under way, at a station with these ``limits``. ``serial``
     is the number that the unit itself has told, ``journal`` the path of a journal that
     an earlier run has left, ``held`` the state of the device once a provisioning is
-    settled."""
+    settled. ``outcome`` is what the run ended with, where its recording has no end."""
 
     path: Path
     tray: str
@@ -70,6 +75,7 @@ class AttemptFile:
     serial: str | None = None
     journal: str | None = None
     held: Held | None = None
+    outcome: Mapping[str, Any] | None = None
 
     def write(self) -> None:
         """Write the file, and return once it is on the disk. Raises DiskError."""
@@ -90,9 +96,18 @@ class AttemptFile:
             else {"state": held.state, "evidence": held.evidence, "observed": held.observations},
         }
         try:
-            write_durably(self.path, json.dumps(document, indent=2) + "\n")
+            write_durably(self.path, (json.dumps(document) + "\n").ljust(ROOM - 1) + "\n")
         except OSError as e:
             raise DiskError(f"{self.path}: cannot be written: {e.strerror}") from e
+
+    def keep(self, outcome: Mapping[str, Any]) -> None:
+        """Put the outcome into the room that the file has for it, for the next start.
+        Raises OSError."""
+        line = json.dumps(outcome).encode()
+        first = self.path.read_bytes().index(b"\n") + 1
+        if first + len(line) >= ROOM:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        overwrite(self.path, first, line + b"\n")
 
     def remove(self) -> None:
         """Remove the file, since the outcome is on the disk. Raises nothing: the next
@@ -104,7 +119,8 @@ class AttemptFile:
     def read(path: Path) -> AttemptFile | None:
         """None where the file is none of ours, or gone."""
         try:
-            held = json.loads(path.read_bytes())
+            first, _, rest = path.read_bytes().partition(b"\n")
+            held = json.loads(first)
             state, work = held["held"], Work(**held["work"])
             if any(isinstance(text, str) and wrong(text) for text in work.document().values()):
                 return None
@@ -126,6 +142,7 @@ class AttemptFile:
                 else Held(
                     DeviceState(state["state"]), Evidence(state["evidence"]), set(map(Observation, state["observed"]))
                 ),
+                _outcome_of(str(held["run"]), rest),
             )
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
             return None
@@ -148,7 +165,8 @@ class Attempts:
 
     @contextmanager
     def under_way(self) -> Iterator[None]:
-        """Hold the tray's lock. Raises InputError if the folder cannot be made."""
+        """Hold the tray's lock. Raises InputError if the folder cannot be made,
+        DiskError if the disk takes nothing."""
         path = self._within / f"{self.tray}.lock"
         try:
             self._lock = _opened(path)
@@ -156,7 +174,8 @@ class Attempts:
             if fcntl is not None:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as e:
-            raise InputError(f"{self.folder}: no folder for recordings: {e.strerror}") from e
+            kind = DiskError if is_of_the_disk(e) else InputError
+            raise kind(f"{self.folder}: no folder for recordings: {e.strerror}") from e
         try:
             yield
         finally:
@@ -200,8 +219,9 @@ class Killed:
 
 
 def settle_killed(station: Station) -> list[Killed]:
-    """Write the outcomes of all killed attempts in the station's folder. Raises
-    InputError, DiskError."""
+    """Write the outcomes of all killed attempts in the station's folder, and seal the
+    recordings that a failing disk has left without an end. Raises InputError,
+    DiskError."""
     within = station.folder / FOLDER
     trays: dict[str, list[AttemptFile]] = {}
     for path in sorted(within.glob("*.json")):
@@ -218,6 +238,10 @@ def settle_killed(station: Station) -> list[Killed]:
                     found += [killed for file in files if file.path.exists() and (killed := _settle(station, file))]
         except OSError as e:
             raise DiskError(f"{e.filename or within}: {e.strerror}; a killed run has no outcome yet") from e
+        except InputError as e:
+            if isinstance(e.__cause__, OSError) and is_of_the_disk(e.__cause__) and not isinstance(e, DiskError):
+                raise DiskError(f"{e}; a killed run has no outcome yet") from e.__cause__
+            raise
     return found
 
 
@@ -257,22 +281,26 @@ def _settle(station: Station, file: AttemptFile) -> Killed | None:
             if document is None and _has_outcome(station.folder, file, recording):
                 file.remove()
                 return None
+        except DiskError:
+            raise
         except (RecordingError, tc.Refused):  # nothing in it can be read: it is kept, and is no recording
             os.replace(recording, recording.with_suffix(DAMAGED))
             attempt = replace(attempt, recording=None)
-    if recording is not None and document is not None:
-        path = write_text(recording.with_suffix(f".{ATTACHMENT}"), to_text(document))
+    beside = None if recording is None else recording.with_suffix(f".{ATTACHMENT}")
+    mended, document = document is not None, document or _document(station, file, attempt, None)
+    if beside is not None and (mended or _run_in(beside) == attempt.run):
+        path = write_text(beside, to_text(document))
     else:
-        document = _document(station, file, attempt, None)
         stem = f"{attempt.work.slot}-{file.serial or 'unknown'}-{_stamp(attempt.started)}"
         path = write_new(station.folder, stem, SUFFIX, to_text(document))
     file.remove()
-    return Killed(document, path, text.killed(attempt.work.slot, attempt.started, path, document, station.path))
+    told = text.killed(attempt.work.slot, attempt.started, path, document, station.path)
+    return Killed(document, path, told)
 
 
 def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> bool:
-    """Whether the killed process had stored its outcome. The documents beside a
-    finished recording are completed from its attachments."""
+    """Whether the process had stored its outcome, and reported no other one. The
+    documents beside a finished recording are completed from its attachments."""
     if recording is None:
         slot = file.attempt.work.slot
         return any(_run_in(path) == file.attempt.run for path in folder.glob(f"{slot}-*{SUFFIX}"))
@@ -281,13 +309,21 @@ def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> boo
             held = {name: finished.attachments[name] for name in (*PAPERS, ATTACHMENT) if name in finished.attachments}
     except (RecordingError, InputError):
         return False
-    if ATTACHMENT not in held or _run(held[ATTACHMENT]) != file.attempt.run:
+    if not _is_final(file, held.get(ATTACHMENT)):
         return False
     for name, data in held.items():
         path = recording.with_suffix(f".{name}")
-        if not path.exists():
+        if not path.exists() or (name == ATTACHMENT and file.outcome is not None):
             write_text(path, data.decode())
     return True
+
+
+def _is_final(file: AttemptFile, stored: bytes | None) -> bool:
+    """Whether a recording ends with the outcome of the attempt. A disk that fails at
+    the very end may leave one that the run could not rely on, and did not report."""
+    if stored is None or _run(stored) != file.attempt.run:
+        return False
+    return file.outcome is None or {**json.loads(stored), "contents": None} == {**file.outcome, "contents": None}
 
 
 def _run_of(recording: Path) -> str | None:
@@ -304,6 +340,12 @@ def _run_in(path: Path) -> str | None:
         return _run(path.read_bytes())
     except OSError:
         return None
+
+
+def _outcome_of(run: str, text: bytes) -> Mapping[str, Any] | None:
+    """The outcome that the run ended with; None where nothing of it, or a part only,
+    came to the disk."""
+    return json.loads(text) if text.strip() and _run(text) == run else None
 
 
 def _run(outcome: bytes) -> str | None:
@@ -327,7 +369,7 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
         recover(recording, draft)
         with Recording.open(draft) as found:
             stored = found.attachments.get(ATTACHMENT)
-        if stored is not None and _run(stored) == attempt.run:
+        if stored is not None and _is_final(file, stored):
             outcome, without = stored, (ATTACHMENT,)
         else:
             # Once without the outcome, which lists what is in the file before it.
@@ -338,7 +380,7 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
                 contents = survey(found, ATTACHMENT).inventory.document()
             document = _document(station, file, attempt, contents)
             outcome = to_text(document).encode()
-        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), outcome)
+        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), outcome, later=document is not None)
         recovery = recover(recording, mended, without=without, sealed=sealed)
         if not recovery.lossless:  # what could not be read may be read by somebody else
             _keep(recording)
@@ -366,6 +408,9 @@ def _keep(recording: Path) -> None:
 def _document(
     station: Station, file: AttemptFile, attempt: Attempt, contents: tc.interchange.Document | None
 ) -> dict[str, Any]:
+    """The outcome that the run ended with, else that of a killed one."""
+    if file.outcome is not None:
+        return {**file.outcome, "recording": attempt.recording, "contents": contents}
     held, journal = _held(station, file)
     return dict(
         outcome_document(

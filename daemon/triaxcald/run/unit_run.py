@@ -187,16 +187,27 @@ class UnitRun(UnitSession):
                 if self._recording is not None or ending.code is not None:
                     self._document = self._outcome_document(ending, None)
         assert ending is not None
+        written = True
         try:
             self._write_artifacts()
         except InputError as e:
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
             code = ending.code if ending.exit_code else Code.DISK
             ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
-        else:
-            if self._attempt_file is not None:
-                self._attempt_file.remove()
+            written = False
+        if self._attempt_file is not None:
+            self._leave(self._attempt_file, written)
         return self._outcome(ending)
+
+    def _leave(self, file: AttemptFile, written: bool) -> None:
+        """Remove the attempt's file; or leave it to the next start, with the outcome
+        if that is not sealed in a recording."""
+        sealed = self._document is not None and self._document["contents"] is not None
+        if written and (sealed or self._recording is None):
+            file.remove()
+        elif not sealed and self._document is not None:
+            with suppress(OSError):  # then the next start takes the run for a killed one
+                file.keep(self._document)
 
     async def _begin(self, tray: Attempts) -> None:
         """Note the attempt on the disk, and wait until all units of the tray have.
@@ -209,6 +220,8 @@ class UnitRun(UnitSession):
         )
         if self._start is not None:
             await self._start.wait(self.name)
+            if work.serial is not None:  # attempts that were settled meanwhile count too
+                await self._count(work.serial)
         if self.stopped_for is not None:  # before it began
             raise asyncio.CancelledError
 
@@ -316,14 +329,18 @@ class UnitRun(UnitSession):
     def _outcome_document(self, ending: Ending, contents: tc.interchange.Document | None) -> tc.interchange.Document:
         certificate = self._certified.document if self._certified else None
         back = self._write_back
+        limits = self.station.file.limits.model_dump()
         return outcome_document(
             ending,
             self._held,
-            Papers(
+            # A recording that the disk has cut short bears out no figure.
+            Papers(limits=limits)
+            if contents is None
+            else Papers(
                 measured=measured_in(certificate) if certificate else None,
                 verification=back.verification if back else None,
                 registers=registers_told(back.provisioning) if back and back.provisioning else None,
-                limits=self.station.file.limits.model_dump(),
+                limits=limits,
                 outside=certificate["outside"] if certificate else (),
                 digests={name: digest_of(self._artifacts[name].encode()) for name in sorted(self._artifacts)},
                 contents=contents,

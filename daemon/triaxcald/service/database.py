@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -16,12 +17,20 @@ from alembic.script import ScriptDirectory
 from alembic.util import CommandError
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.engine.interfaces import ExceptionContext
+from sqlalchemy.exc import ArgumentError, InvalidatePoolError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.pool import NullPool, QueuePool
 
 from triaxcald.errors import InputError, StationError
+from triaxcald.files import new_beside
 
 BUSY_S: Final = 5
 """Longest wait for another process."""
+PATIENCE: Final = {
+    "connect_timeout": BUSY_S, "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3,
+    "tcp_user_timeout": 20_000,
+}  # fmt: skip
+"""Of connections to PostgreSQL: a server that is gone is found out within 25 s."""
 MIGRATIONS: Final = Path(__file__).parent / "migrations"
 
 
@@ -39,13 +48,67 @@ def answering() -> Iterator[None]:
         raise DatabaseError(f"the database does not answer: {first[0] if first else type(e).__name__}") from e
 
 
-def sqlite_engine(path: Path) -> Engine:
-    """Transactions begin with the right to write, for which two cannot wait at once."""
-    engine = create_engine(f"sqlite:///{path}", connect_args={"timeout": BUSY_S, "check_same_thread": False})
+class SqliteFile:
+    """A file of SQLite that another process may replace, or this one where it is
+    damaged: connections of its `engine` are to the file that is there. ``prepare``
+    makes tables in a file that is new; it is called with whether the file seems
+    damaged, before a connection is opened."""
+
+    def __init__(self, path: Path, prepare: Callable[[bool], None]) -> None:
+        self.path, self._prepare = path, prepare
+        self._lock = threading.Lock()
+        self._known: int | None = None
+        self._suspect = False
+        self.engine = engine = create_engine("sqlite://", creator=self._connect, poolclass=QueuePool)
+        _set_up(engine)
+        event.listen(engine, "connect", self._note)
+        event.listen(engine, "checkout", self._follow)
+        event.listen(engine, "handle_error", self._doubt)
+
+    def _connect(self) -> sqlite3.Connection:
+        with self._lock:
+            if self._suspect or self._known is None or self._known != self._inode():
+                self._prepare(self._suspect)
+                self._known, self._suspect = self._inode(), False
+        return _connected(self.path)
+
+    def _inode(self) -> int | None:
+        try:
+            return os.lstat(self.path).st_ino
+        except OSError:
+            return None
+
+    def _note(self, _: Any, record: Any) -> None:
+        record.info["inode"] = self._inode()
+
+    def _follow(self, _: Any, record: Any, __: Any) -> None:
+        if record.info.get("inode") != self._inode():
+            raise InvalidatePoolError
+
+    def _doubt(self, context: ExceptionContext) -> None:
+        """Open the file anew where it seems damaged: it is checked first."""
+        code = getattr(context.original_exception, "sqlite_errorcode", 0) & 0xFF
+        if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            self._suspect = context.is_disconnect = True
+
+
+def plain_engine(path: Path) -> Engine:
+    """Of a file as it is, for one connection at a time."""
+    engine = create_engine("sqlite://", creator=lambda: _connected(path), poolclass=NullPool)
+    _set_up(engine)
+    return engine
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+
+
+def _set_up(engine: Engine) -> None:
+    """Transactions begin with the right to write, for which two cannot wait at once;
+    those with the option ``reading`` do not."""
 
     @event.listens_for(engine, "connect")
     def prepare(connection: Any, _: Any) -> None:
-        connection.isolation_level = None
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")
 
@@ -53,8 +116,6 @@ def sqlite_engine(path: Path) -> Engine:
     def begin(connection: Connection) -> None:
         reading = connection.get_execution_options().get("reading", False)
         connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
-
-    return engine
 
 
 def postgresql_engine(url: str) -> Engine:
@@ -69,7 +130,7 @@ def postgresql_engine(url: str) -> Engine:
         "postgresql+psycopg", parsed.username, parsed.password, parsed.host, parsed.port, parsed.database, parsed.query
     )
     try:
-        return create_engine(parsed, pool_pre_ping=True, connect_args={"connect_timeout": BUSY_S})
+        return create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
     except (ImportError, NoSuchModuleError) as e:
         raise InputError("--database: pip install 'triaxcal[postgres]' brings what speaks to PostgreSQL") from e
 
@@ -96,18 +157,24 @@ def migrate(engine: Engine) -> None:
 
 
 def copy_sqlite(path: Path, to: Path) -> None:
-    """A consistent copy, while others write; ``to`` appears when it is complete. Raises
-    InputError."""
-    partial = to.with_name(f"{to.name}.partial")
+    """A consistent copy, while others write; ``to`` appears when it is complete, and
+    may replace an earlier copy alone. Raises InputError."""
     try:
-        with (
-            closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=BUSY_S)) as source,
-            closing(sqlite3.connect(partial)) as target,
-        ):
-            source.backup(target, pages=1000)
-        with partial.open("rb") as copied:
-            os.fsync(copied.fileno())
-        os.replace(partial, to)
+        if to.exists() and (to.samefile(path) or not _is_sqlite(to)):
+            raise InputError(f"--backup {to}: exists already, and is no earlier copy")
+        with new_beside(to) as partial:
+            with (
+                closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=BUSY_S)) as source,
+                closing(sqlite3.connect(partial)) as target,
+            ):
+                source.backup(target, pages=1000)
+            with partial.open("rb") as copied:
+                os.fsync(copied.fileno())
     except (sqlite3.Error, OSError) as e:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"--backup {to}: {e}") from e
+        raise InputError(f"--backup {to}: {getattr(e, 'strerror', None) or e}") from e
+
+
+def _is_sqlite(path: Path) -> bool:
+    """Raises OSError."""
+    with path.open("rb") as file:
+        return file.read(16) == b"SQLite format 3\0"

@@ -201,14 +201,14 @@ class Floor:
         """Stop what is at work, and wait until each device is in order. Each
         cancellation meanwhile is passed on to the units."""
         self._stopping = True
-        if self._task is not None:
+        if (task := self._task) is not None:
             for slot in self.desk.slots:
                 self._stop(slot, "the service was stopped")
-            while not self._task.done():
+            while not task.done():
                 try:
-                    await asyncio.wait([self._task])
+                    await asyncio.wait([task])
                 except asyncio.CancelledError:
-                    self._task.cancel()
+                    task.cancel()
         await self._save()
 
     # A tray.

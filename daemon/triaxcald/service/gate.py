@@ -332,7 +332,10 @@ class StationProtocol(H11Protocol):
         self.transport.abort()
 
     def send_400_response(self, msg: str) -> None:
-        """What is no HTTP."""
+        """What is no HTTP, as the head of a request or in the midst of its body."""
+        if self.cycle is not None:  # whatever it would answer now comes too late
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
         if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):  # in the midst of an answer
             self.transport.abort()
             return

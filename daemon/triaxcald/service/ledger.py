@@ -5,32 +5,38 @@ from __future__ import annotations
 
 import base64
 import binascii
+import errno
 import json
 import os
+import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sqlalchemy import Connection, Engine, Select, Table, and_, delete, func, insert, or_, select, update
+from sqlalchemy import Connection, Engine, Select, Table, and_, delete, func, insert, inspect, or_, select, update
 
 from triaxcald.errors import InputError
 from triaxcald.outcome import SUFFIX
+from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
 from triaxcald.service import tables
 from triaxcald.service.database import (
     DatabaseError,
+    SqliteFile,
     answering,
     copy_sqlite,
     migrate,
+    plain_engine,
     postgresql_engine,
-    sqlite_engine,
 )
 from triaxcald.station.config import Station
-from triaxcald.store import BESIDE, FILE_NAME, OWN_COLUMNS, Store
+from triaxcald.store import BESIDE, FILE_NAME, VERSION, Store
+from triaxcald.utc import iso_time
 from triaxcald.work import plain_serial
 
 EVENTS_KEPT: Final = 10_000
@@ -41,6 +47,18 @@ FIGURES: Final = ("rms_g", "cross_validated_rms_g", "verification_rms_g")
 """Measurements with a limit."""
 COEFFICIENTS: Final = {"scale_factor": "output/g", "misalignment": "rad", "bias": "g"}
 WAITING, DELIVERED, REFUSED = "waiting", "delivered", "refused"
+RECEIVER: Final = "receiver "
+"""Key of a setting, before the receiver's name."""
+NAMED: Final = "receiver"
+"""Action in the trail: a receiver was first named."""
+TAIL: Final = 1 << 20
+"""Bytes of the end of `trail.jsonl` that are compared with the trail at each start."""
+AT_MOST_US: Final = 2**63 - 1
+"""What a database can hold."""
+LOOK_MOST: Final = 200
+"""Runs whose files are looked for one by one."""
+LOCK: Final = 74112
+"""Of a PostgreSQL server, with the name of the station: who takes its runs."""
 
 
 @dataclass(frozen=True)
@@ -99,17 +117,20 @@ class Delivery:
 
 
 class Ledger:
-    """The database of the service at a station. Use `open`."""
+    """The database of the service at a station. Use `open` or `of_folder`."""
 
-    def __init__(self, station: Station, engine: Engine) -> None:
-        self.engine = engine
-        self.home = station.file.name
-        self.folder = station.folder
-        self._receivers = tuple(receiver.name for receiver in station.file.deliver)
-        self._store = Store(station.folder)
+    def __init__(self, station: str, folder: Path, receivers: tuple[str, ...], url: str | None) -> None:
+        self.station, self.folder = station, folder
+        self.lost: str | None = None
+        """What people have to do where the file was damaged or removed."""
+        self._file = SqliteFile(self.folder / FILE_NAME, self._prepare_file) if url is None else None
+        self.engine: Engine = postgresql_engine(url) if url is not None else self._sqlite_file.engine
+        self.home = tables.HERE if url is None else self.station
+        self._receivers = receivers
+        self._since_us: dict[str, int] = {}
+        self._store = Store(folder)
         self._taking = threading.Lock()
         self._trailing = threading.Lock()
-        self._inode: int | None = None
 
     @staticmethod
     def open(station: Station, url: str | None = None) -> Ledger:
@@ -118,18 +139,36 @@ class Ledger:
             station.folder.mkdir(parents=True, exist_ok=True)
         except OSError as e:
             raise InputError(f"{station.folder}: no folder for recordings: {e.strerror}") from e
-        engine = sqlite_engine(station.folder / FILE_NAME) if url is None else postgresql_engine(url)
-        ledger = Ledger(station, engine)
-        try:
-            ledger._prepare()
-        except BaseException:
-            ledger.close()
-            raise
+        ledger = Ledger(station.file.name, station.folder, _receivers(station), url)
+        ledger._begin()
         return ledger
+
+    @staticmethod
+    def of_folder(folder: Path, station: str, url: str | None = None) -> Ledger:
+        """Without the station's file, whose name is ``station``. Raises InputError,
+        DatabaseError."""
+        ledger = Ledger(station, folder, (), url)
+        ledger._begin()
+        setting = tables.setting
+        query = select(setting.c.key).where(setting.c.home == ledger.home, setting.c.key.startswith(RECEIVER))
+        with ledger.reading() as db:
+            ledger._receivers = tuple(key.removeprefix(RECEIVER) for key in db.execute(query).scalars())
+        return ledger
+
+    def _begin(self) -> None:
+        try:
+            if not self._sqlite:
+                migrate(self.engine)
+                self._join_trail(self.engine)
+            with self.reading():
+                pass
+        except BaseException:
+            self.close()
+            raise
 
     def receive(self, station: Station) -> None:
         """The station file was read again."""
-        self._receivers = tuple(receiver.name for receiver in station.file.deliver)
+        self._receivers = _receivers(station)
 
     def close(self) -> None:
         self.engine.dispose()
@@ -138,7 +177,7 @@ class Ledger:
     @property
     def path(self) -> Path | None:
         """The file of an SQLite database."""
-        return self.folder / FILE_NAME if self._sqlite else None
+        return None if self._file is None else self._file.path
 
     @property
     def run(self) -> Table:
@@ -147,44 +186,54 @@ class Ledger:
 
     @property
     def _sqlite(self) -> bool:
-        return self.engine.dialect.name == "sqlite"
+        return self._file is not None
 
-    def _prepare(self) -> None:
-        """Make the tables. A new file gets the trail back from its other copy."""
-        if self._sqlite:
-            self._store.make()  # the tables of the index come first
-        migrate(self.engine)
-        self._inode = self._present_inode()
-        if self._sqlite:
-            self._bring_trail_back()
+    @property
+    def _sqlite_file(self) -> SqliteFile:
+        assert self._file is not None
+        return self._file
 
-    def _present_inode(self) -> int | None:
-        if not self._sqlite:
-            return None
-        try:
-            return (self.folder / FILE_NAME).stat().st_ino
-        except OSError:
-            return None
+    def _prepare_file(self, suspect: bool) -> None:
+        """Make the tables of a file that is new, and check one that is ``suspect``. A
+        new file gets the trail back from its other copy. Raises DatabaseError,
+        InputError."""
+        path = self._sqlite_file.path
+        if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+            raise InputError(f"{path}: expected a file of its own")
+        with Store(self.folder) as index:  # its tables come first
+            if not index.make():
+                raise _later_or_held(path)
+        engine = plain_engine(path)
+        with answering():
+            known = inspect(engine).has_table("alembic_version")
+        migrate(engine)
+        before = self._join_trail(engine)
+        if not known and (before or suspect):
+            self.lost = (
+                f"{path}: the database was damaged or removed, and is made anew from the folder: "
+                "people and tokens have to be entered anew"
+            )
+        self._since_us = {}
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """One transaction. Raises DatabaseError."""
-        self._follow_file()
         with answering(), self.engine.begin() as db:
             yield db
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Raises DatabaseError."""
-        self._follow_file()
         with answering(), self.engine.connect().execution_options(reading=True) as db:
             yield db
 
-    def _follow_file(self) -> None:
-        """Leave a file that was set aside as damaged, or deleted."""
-        if self._sqlite and self._present_inode() != self._inode:
-            self.engine.dispose()
-            self._prepare()
+    @contextmanager
+    def _taking_alone(self) -> Iterator[Connection]:
+        """One transaction, beside which no other process takes runs of this station."""
+        with self.writing() as db:
+            if not self._sqlite:
+                db.execute(select(func.pg_advisory_xact_lock(LOCK, func.hashtext(self.home))))
+            yield db
 
     # Runs.
 
@@ -197,6 +246,10 @@ class Ledger:
                 there = self._store.digests()
             except OSError as e:
                 raise InputError(f"{self.folder}: {e.strerror}") from e
+            if self._sqlite and self._store.in_memory:
+                self._store.close()  # the next look tries the file again
+                raise _later_or_held(self.folder / FILE_NAME)
+            self.begin_deliveries()
             home = tables.filed.c.home == self.home
             with self.reading() as db:
                 found = db.execute(select(tables.filed.c.outcome, tables.filed.c.outcome_sha256).where(home))
@@ -204,49 +257,44 @@ class Ledger:
             gone = [outcome for outcome in filed if outcome not in there]
             due = [outcome for outcome, digest in there.items() if filed.get(outcome) != digest]
             for start in range(0, len(gone), BATCH):
-                with self.writing() as db:
+                with self._taking_alone() as db:
                     self._forget(db, gone[start : start + BATCH])
             new: list[str] = []
             for start in range(0, len(due), BATCH):
                 rows = self._store.rows(due[start : start + BATCH])
-                with self.writing() as db:
-                    self._file(db, sorted(rows, key=lambda row: (row["ended_us"], row["outcome"])))
+                with self._taking_alone() as db:
+                    self._enter(db, sorted(rows, key=lambda row: (row["ended_us"], row["outcome"])))
                 new += [str(row["run"]) for row in rows if row["outcome"] not in filed and row["run"] is not None]
             return new
 
-    def _file(self, db: Connection, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Make the rows of these outcomes anew."""
+    def _enter(self, db: Connection, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Make the rows of these outcomes anew, with what is to be delivered."""
         self._forget(db, [row["outcome"] for row in rows])
         if not self._sqlite:
-            kept = (*NAMES, *OWN_COLUMNS)
-            db.execute(insert(tables.shared_run), [{"home": self.home, **{k: row[k] for k in kept}} for row in rows])
+            db.execute(insert(tables.shared_run), [{"home": self.home, **row} for row in rows])
         if rows:
             db.execute(insert(tables.filed), [self._filed(row) for row in rows])
         measured = [m for row in rows for m in measurements_of(row)]
         if measured:
             db.execute(insert(tables.measurement), [{"home": self.home, **m} for m in measured])
         self._count_units(db, {self._filed(row)["plain_serial"] for row in rows})
-        since = {receiver: self._since(db, receiver) for receiver in self._receivers}
-        sent = {
-            (receiver, run)
-            for receiver, run in db.execute(
-                select(tables.outbox.c.receiver, tables.outbox.c.run).where(
-                    tables.outbox.c.home == self.home, tables.outbox.c.run.in_([row["run"] for row in rows])
-                )
-            )
-        }
+        self._send(db, rows)
+
+    def _send(self, db: Connection, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Have the runs delivered that no receiver has got."""
+        if set(self._since_us) != set(self._receivers):
+            raise DatabaseError("the database was made anew meanwhile")  # the next look enters them
+        out = tables.outbox
+        here = and_(out.c.home == self.home, out.c.run.in_([row["run"] for row in rows]))
+        sent = {(row.receiver, row.run) for row in db.execute(select(out.c.receiver, out.c.run).where(here))}
         added_us = time.time_ns() // 1000
-        out = [
-            {
-                "home": self.home, "receiver": receiver, "run": row["run"], "outcome": row["outcome"],
-                "state": WAITING, "tries": 0, "added_us": added_us,
-            }
-            for row in rows
-            for receiver in self._receivers
-            if row["run"] is not None and row["ended_us"] >= since[receiver] and (receiver, row["run"]) not in sent
-        ]  # fmt: skip
-        if out:
-            db.execute(insert(tables.outbox), out)
+        for row in rows:
+            for receiver, since_us in self._since_us.items():
+                if row["run"] is None or row["ended_us"] < since_us or (receiver, row["run"]) in sent:
+                    continue
+                sent.add((receiver, row["run"]))  # the folder may hold a copy of the outcome
+                made = {"receiver": receiver, "run": row["run"], "outcome": row["outcome"], "added_us": added_us}
+                db.execute(insert(out).values(home=self.home, state=WAITING, tries=0, **made))
 
     def _forget(self, db: Connection, outcomes: Sequence[str]) -> None:
         """Remove what was made from these outcomes."""
@@ -264,12 +312,14 @@ class Ledger:
         self._count_units(db, serials)
 
     def _filed(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        serial = row["serial"] if row["serial"] is not None else row["work_serial"]
+        reported = row["serial"]
+        serial = reported if row["work_serial"] is None else row["work_serial"]
         return {
             "home": self.home,
             **{key: row[key] for key in ("outcome", "outcome_sha256", "run", "at_us", "ended_us", "verdict", "code")},
             "serial": serial,
             "plain_serial": None if serial is None else plain_serial(serial),
+            "plain_reported": None if reported is None else plain_serial(reported),
             "tried": bool(row["tried"]),
         }
 
@@ -302,21 +352,31 @@ class Ledger:
             "run": last.run,
         }
 
-    def _since(self, db: Connection, receiver: str) -> int:
-        """From when on runs are delivered: since the receiver was first named. What
-        ended in the same second counts, as a killed service may have left it."""
-        key = f"receiver {receiver}"
-        value = self._setting(db, key)
-        if value is None:
-            value = int(time.time()) * 1_000_000
-            self._put_setting(db, key, value)
-        return int(value)
-
     def begin_deliveries(self) -> None:
-        """Note from when on each receiver gets results."""
-        with self.writing() as db:
-            for receiver in self._receivers:
-                self._since(db, receiver)
+        """Note from when on each receiver gets results: since it was first named. What
+        ended in the same second counts, as a killed service may have left it. The trail
+        has it too, and so it outlives the database. Raises DatabaseError."""
+        if set(self._since_us) == set(self._receivers):
+            return
+        found: dict[str, int] = {}
+        for receiver in self._receivers:
+            key = RECEIVER + receiver
+            since_us = self.setting(key)
+            if since_us is None and (since_us := self._first_named(receiver)) is None:
+                since_us = time.time_ns() // 1_000_000_000 * 1_000_000
+                what = {"receiver": receiver, "since_us": since_us}
+                self.trail(iso_time(time.time_ns()), None, None, NAMED, what, True, None)
+            self.put_setting(key, since_us)
+            found[receiver] = int(since_us)
+        self._since_us = found
+
+    def _first_named(self, receiver: str) -> int | None:
+        """As the trail has it."""
+        trail = tables.trail
+        query = select(trail.c.what).where(trail.c.action == NAMED, trail.c.station == self.station)
+        with self.reading() as db:
+            told = [json.loads(what) for what in db.execute(query.order_by(trail.c.id)).scalars()]
+        return next((w["since_us"] for w in told if w["receiver"] == receiver), None)
 
     # Questions about runs.
 
@@ -332,20 +392,31 @@ class Ledger:
         with self.reading() as db:
             rows = db.execute(query).mappings().all()
         following = _cursor(rows[limit - 1]) if len(rows) > limit else None
-        return [self._document(row) for row in rows[:limit]], following
+        return self._documents(rows[:limit]), following
 
     def every(self, wanted: RunFilter) -> list[dict[str, Any]]:
         """All these runs, in the order of time."""
         run = self.run
         query = self._wanted(select(run), wanted).order_by(run.c.at_us, run.c.outcome)
         with self.reading() as db:
-            return [self._document(row) for row in db.execute(query).mappings()]
+            rows = db.execute(query).mappings().all()
+        return self._documents(rows)
 
     def run_of(self, run_id: str) -> dict[str, Any] | None:
         """The run of that id."""
         with self.reading() as db:
-            row = db.execute(self._here(select(self.run)).where(self.run.c.run == run_id)).mappings().first()
-        return None if row is None else self._document(row)
+            query = self._here(select(self.run)).where(self.run.c.run == run_id).order_by(self.run.c.outcome)
+            rows = db.execute(query.limit(1)).mappings().all()
+        return next(iter(self._documents(rows)), None)
+
+    def _documents(self, rows: Sequence[Mapping[Any, Any]]) -> list[dict[str, Any]]:
+        """Runs with the columns of `results`; files that are not in the folder are not
+        named."""
+        if len(rows) > LOOK_MOST:
+            with suppress(OSError):
+                names = frozenset(os.listdir(self.folder))
+                return [_document(row, names.__contains__) for row in rows]
+        return [_document(row, lambda name: os.path.lexists(self.folder / name)) for row in rows]
 
     def unit(self, serial: str) -> list[dict[str, Any]]:
         """All runs of a unit, in the order of time."""
@@ -354,28 +425,20 @@ class Ledger:
     def measurements_of(self, run_id: str) -> list[dict[str, Any]]:
         """The figures of a run."""
         made = tables.measurement
-        query = select(made).where(made.c.home == self.home, made.c.run == run_id)
+        query = select(made).where(made.c.home == self.home, made.c.run == run_id).order_by(made.c.outcome.desc())
         keys = ("name", "value", "unit", "low", "high", "passed")
         with self.reading() as db:
-            found = [{key: row[key] for key in keys} for row in db.execute(query).mappings()]
-        return sorted(found, key=lambda m: MEASUREMENTS.index(m["name"]))
-
-    def _document(self, row: Mapping[Any, Any]) -> dict[str, Any]:
-        """A run with the columns of `results`; files that are gone have no name."""
-        found = {name: row[name] for name in NAMES}
-        for name in _TEXTS:
-            found[name] = None if row[name] is None else json.loads(row[name])
-        for name in BESIDE:
-            if row[name] is not None and not os.path.lexists(self.folder / row[name]):
-                found[name] = None
-        return found
+            # The folder may hold a copy of the outcome.
+            found = {row["name"]: {key: row[key] for key in keys} for row in db.execute(query).mappings()}
+        return [found[name] for name in MEASUREMENTS if name in found]
 
     def _wanted(self, query: Select[Any], wanted: RunFilter) -> Select[Any]:
         run, filed = self.run, tables.filed
         query = self._here(query).where(*wanted.conditions(run))
         if wanted.serial is not None:
+            plain = plain_serial(wanted.serial)
             of_unit = select(filed.c.outcome).where(
-                filed.c.home == self.home, filed.c.plain_serial == plain_serial(wanted.serial)
+                filed.c.home == self.home, or_(filed.c.plain_serial == plain, filed.c.plain_reported == plain)
             )
             query = query.where(run.c.outcome.in_(of_unit))
         return query
@@ -384,6 +447,44 @@ class Ledger:
         """Of this station alone."""
         return query if self._sqlite else query.where(tables.shared_run.c.home == self.home)
 
+    def in_order(self, wanted: RunFilter, size: int) -> Iterator[list[dict[str, Any]]]:
+        """All these runs in the order of time, ``size`` of them at a time, each batch
+        read when it is asked for."""
+        run = self.run
+        query = self._wanted(select(run), wanted).order_by(run.c.at_us, run.c.outcome).limit(size)
+        last: Mapping[Any, Any] | None = None
+        while True:
+            following = query
+            if last is not None:
+                later = and_(run.c.at_us == last["at_us"], run.c.outcome > last["outcome"])
+                following = query.where(or_(run.c.at_us > last["at_us"], later))
+            with self.reading() as db:
+                rows = db.execute(following).mappings().all()
+            if rows:
+                yield self._documents(rows)
+            if len(rows) < size:
+                return
+            last = rows[-1]
+
+    def columns(self, wanted: RunFilter, names: Sequence[str]) -> list[dict[str, Any]]:
+        """These columns of all these runs, in the order of time; `tables.local_run` has
+        their names. Files may be named that are not in the folder."""
+        run = self.run
+        query = self._wanted(select(*(run.c[name] for name in names)), wanted).order_by(run.c.at_us, run.c.outcome)
+        with self.reading() as db:
+            return [dict(zip(names, row, strict=True)) for row in db.execute(query)]
+
+    def first_judged(self) -> dict[str, int]:
+        """Time of the first attempt at each unit that passed or failed [µs since 1970],
+        by plain serial number."""
+        filed = tables.filed
+        query = select(filed.c.plain_serial, func.min(filed.c.at_us)).where(
+            filed.c.home == self.home, filed.c.plain_serial.is_not(None), filed.c.tried,
+            filed.c.verdict.in_((Verdict.PASS.value, Verdict.FAIL.value)),
+        )  # fmt: skip
+        with self.reading() as db:
+            return {str(serial): int(at_us) for serial, at_us in db.execute(query.group_by(filed.c.plain_serial))}
+
     # Events.
 
     def append(self, events: list[dict[str, Any]]) -> None:
@@ -391,7 +492,7 @@ class Ledger:
         rows = [
             {
                 "home": self.home, "seq": event["seq"], "run": event.get("run"),
-                "event": json.dumps(event, ensure_ascii=False, allow_nan=False),
+                "event": json.dumps(event, allow_nan=False),
             }
             for event in events
         ]  # fmt: skip
@@ -438,7 +539,7 @@ class Ledger:
 
     def _put_setting(self, db: Connection, key: str, value: Any) -> None:
         setting = tables.setting
-        text = json.dumps(value, ensure_ascii=False)
+        text = json.dumps(value)
         here = update(setting).where(setting.c.home == self.home, setting.c.key == key)
         if not db.execute(here.values(value=text)).rowcount:
             db.execute(insert(setting).values(home=self.home, key=key, value=text))
@@ -451,39 +552,56 @@ class Ledger:
     ) -> None:  # fmt: skip
         """A row of the trail, and a line in `trail.jsonl`. Raises DatabaseError."""
         row = {
-            "time": time, "home": self.home, "who": who, "role": role, "action": action,
-            "what": json.dumps(what, ensure_ascii=False), "ok": ok, "code": code,
+            "uid": uuid.uuid4().hex, "time": time, "station": self.station, "who": who, "role": role, "action": action,
+            "what": json.dumps(what), "ok": ok, "code": code,
         }  # fmt: skip
         with self._trailing, self.writing() as db:
             db.execute(insert(tables.trail).values(row))
             self._append_line({**row, "what": what})
 
     def _append_line(self, line: Mapping[str, Any]) -> None:
-        """Raises DatabaseError: the row is then taken back, so that both agree."""
-        data = (json.dumps(line, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace")
+        """Raises DatabaseError: the row is then taken back."""
+        data = (json.dumps(line) + "\n").encode()
         try:
-            descriptor = os.open(self.folder / TRAIL, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o640)
+            descriptor = os.open(self.folder / TRAIL, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o640)
             try:
-                os.write(descriptor, data)
+                size = os.fstat(descriptor).st_size
+                if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                    data = b"\n" + data  # the last line was cut short
+                if os.write(descriptor, data) < len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
         except OSError as e:
             raise DatabaseError(f"{self.folder / TRAIL}: {e.strerror}") from e
 
-    def _bring_trail_back(self) -> None:
-        """Fill an empty trail from `trail.jsonl`."""
-        with suppress(OSError), answering(), self.engine.begin() as db:
-            if db.execute(select(func.count()).select_from(tables.trail)).scalar():
-                return
-            rows = []
-            for line in (self.folder / TRAIL).read_text("utf-8").splitlines():
+    def _join_trail(self, engine: Engine) -> bool:
+        """Enter lines of `trail.jsonl` that have no row: all of them in a new file,
+        else the last ones, as after a kill. Gives whether there are lines. Raises
+        DatabaseError."""
+        trail = tables.trail
+        with answering(), engine.begin() as db:
+            empty = db.execute(select(trail.c.id).where(trail.c.station == self.station).limit(1)).first() is None
+            try:
+                lines = _last_lines(self.folder / TRAIL, None if empty else TAIL)
+            except FileNotFoundError:
+                return False
+            except OSError as e:
+                raise DatabaseError(f"{self.folder / TRAIL}: {e.strerror}") from e
+            held: dict[str, dict[str, Any]] = {}
+            for line in lines:
                 with suppress(ValueError, KeyError, TypeError):  # a line that was cut short
-                    held = json.loads(line)
-                    keys = ("time", "home", "who", "role", "action", "ok", "code")
-                    rows.append({**{key: held[key] for key in keys}, "what": json.dumps(held["what"])})
-            if rows:
-                db.execute(insert(tables.trail), rows)
+                    told = json.loads(line)
+                    row = {c.name: told[c.name] for c in trail.c if c.name not in ("id", "what")}
+                    held[told["uid"]] = {**row, "what": json.dumps(told["what"])}
+            uids = list(held)
+            for start in range(0, len(uids), BATCH):
+                batch = uids[start : start + BATCH]
+                there = set(db.execute(select(trail.c.uid).where(trail.c.uid.in_(batch))).scalars())
+                if missing := [held[uid] for uid in batch if uid not in there]:
+                    db.execute(insert(trail), missing)
+        return bool(lines)
 
     # Deliveries.
 
@@ -496,6 +614,13 @@ class Ledger:
         with self.reading() as db:
             row = db.execute(query.order_by(out.c.id).limit(1)).first()
         return None if row is None else Waiting(*row)
+
+    def has_delivered(self, receiver: str) -> bool:
+        """Whether a result ever reached the receiver."""
+        out = tables.outbox
+        here = and_(out.c.home == self.home, out.c.receiver == receiver, out.c.state == DELIVERED)
+        with self.reading() as db:
+            return db.execute(select(out.c.id).where(here).limit(1)).first() is not None
 
     def end_delivery(self, waiting: Waiting, error: str | None) -> None:
         """The result is delivered, or refused for good with this ``error``."""
@@ -574,6 +699,36 @@ MEASUREMENTS: Final = (*FIGURES, *(f"{kind}_{axis}" for kind in COEFFICIENTS for
 _TEXTS: Final = frozenset(c.name for c in COLUMNS if c.kind is Kind.TEXTS)
 
 
+def _document(row: Mapping[Any, Any], exists: Callable[[str], bool]) -> dict[str, Any]:
+    """A run with the columns of `results`."""
+    found = {name: json.loads(row[name]) if name in _TEXTS and row[name] is not None else row[name] for name in NAMES}
+    for name in BESIDE:
+        if found[name] is not None and not exists(found[name]):
+            found[name] = None
+    return found
+
+
+def _receivers(station: Station) -> tuple[str, ...]:
+    return tuple(receiver.name for receiver in station.file.deliver)
+
+
+def _last_lines(path: Path, size: int | None) -> list[bytes]:
+    """The whole lines within the last ``size`` bytes of a file. Raises OSError."""
+    with path.open("rb") as file:
+        start = 0 if size is None else max(0, file.seek(0, os.SEEK_END) - size)
+        file.seek(start)
+        lines = file.read().splitlines()
+    return lines[1:] if start else lines
+
+
+def _later_or_held(path: Path) -> InputError | DatabaseError:
+    """Why there is no file of the index."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+        if db.execute("PRAGMA user_version").fetchone()[0] > VERSION:
+            return InputError(f"{path}: of a later version of triaxcal")
+    return DatabaseError(f"{path}: the file cannot be written, or another process holds it")
+
+
 def _cursor(row: Mapping[Any, Any]) -> str:
     return base64.urlsafe_b64encode(f"{row['at_us']}:{row['outcome']}".encode()).decode()
 
@@ -581,7 +736,7 @@ def _cursor(row: Mapping[Any, Any]) -> str:
 def _place(cursor: str) -> tuple[int, str]:
     try:
         at_us, _, outcome = base64.urlsafe_b64decode(cursor.encode()).decode().partition(":")
-        if not outcome.endswith(SUFFIX):
+        if not outcome.endswith(SUFFIX) or not -AT_MOST_US <= int(at_us) <= AT_MOST_US:
             raise ValueError
         return int(at_us), outcome
     except (ValueError, binascii.Error) as e:

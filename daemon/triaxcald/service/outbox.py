@@ -6,9 +6,14 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
+import os
+import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,20 +22,28 @@ import httpx
 import triaxcal_drivers as td
 from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, InputError
-from triaxcald.files import write_text
+from triaxcald.files import new_file, synchronise
 from triaxcald.inputs import DOCUMENT_MOST, parse_document
+from triaxcald.printable import printable
 from triaxcald.service.ledger import Delivery, Ledger, Waiting
 from triaxcald.station.config import Receiver, Station
 
 FIRST_S, LONGEST_S = 1.0, 300.0
 """Pauses between tries: the first, doubled each time up to the longest."""
 ANSWER_S: Final = 30.0
+"""Longest wait for the whole answer."""
+ANSWER_MOST: Final = 4096
+"""Bytes of an answer that are read."""
+WISH_MOST_S: Final = 3600.0
+"""Longest pause that a receiver may wish for."""
 TAKEN: Final = 409
 """A receiver that has the result already says so."""
 AGAIN: Final = frozenset((408, 429))
 """With every status from 500 on: the receiver may take it later."""
 ERROR_MOST: Final = 300
 BLOCK: Final = 1 << 20
+RUN: Final = re.compile(r"[0-9A-Za-z][0-9A-Za-z-]{0,63}")
+"""Ids of runs, which become names of files."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,9 @@ class Refused(Exception):
     """The receiver will never take the result."""
 
     why: str
+
+
+_pause = asyncio.sleep
 
 
 class Outbox:
@@ -101,17 +117,22 @@ class Outbox:
                     after_s = await self._try(client, receiver, waiting)
                 except DaemonError as e:  # of the database; what waits is still there
                     self._log(f"triaxcal: deliver {receiver.name}: {e}")
-                    after_s = pause_s
+                    after_s = 0.0
+                except Exception as e:  # noqa: BLE001 - a fault of ours delays the results of one receiver alone
+                    self._log(f"triaxcal: deliver {receiver.name}: {type(e).__name__}: {e}")
+                    after_s = 0.0
                 if after_s is None:
                     pause_s = self._first_s
                     continue
-                await asyncio.sleep(max(pause_s, after_s))
+                await _pause(max(pause_s, after_s))
                 pause_s = min(2 * pause_s, LONGEST_S)
 
     async def _try(self, client: httpx.AsyncClient, receiver: Receiver, waiting: Waiting) -> float | None:
         """Deliver a result. Gives the least pause before the next try, None at the
         end. Raises DaemonError of the database."""
         try:
+            if not RUN.fullmatch(waiting.run):
+                raise Refused(f"'{printable(waiting.run[:40])}' is no id of a run")
             data = await asyncio.to_thread(self._result, waiting)
             if receiver.url is not None:
                 await self._post(client, receiver, waiting.run, data)
@@ -135,18 +156,21 @@ class Outbox:
         headers = {"Content-Type": "application/json", "Idempotency-Key": run}
         if receiver.token_file is not None:
             headers["Authorization"] = f"Bearer {await asyncio.to_thread(self._token, receiver.token_file)}"
+        told = ""
         try:
-            answer = await client.post(receiver.url, content=data, headers=headers)
-        except httpx.HTTPError as e:
-            raise NotNow(f"{receiver.url}: {str(e) or type(e).__name__}") from e
-        except (httpx.InvalidURL, UnicodeError) as e:
-            raise NotNow(f"{receiver.url}: {e}") from e
+            async with asyncio.timeout(ANSWER_S):
+                async with client.stream("POST", receiver.url, content=data, headers=headers) as answer:
+                    if answer.is_success or answer.status_code == TAKEN:
+                        return
+                    told = await _beginning(answer)
+        except TimeoutError as e:
+            raise NotNow(f"{_shown(receiver.url)} does not answer within {ANSWER_S:g} s") from e
+        except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as e:
+            raise NotNow(f"{_shown(receiver.url)}: {str(e) or type(e).__name__}") from e
         status = answer.status_code
-        if answer.is_success or status == TAKEN:
-            return
-        why = f"{receiver.url} answers {status}: {' '.join(answer.text.split())[:100]}".rstrip(": ")
+        why = f"{_shown(receiver.url)} answers {status}: {printable(' '.join(told.split()))[:100]}".rstrip(": ")
         if status in AGAIN or status >= 500 or status < 400:
-            raise NotNow(why, _seconds(answer.headers.get("Retry-After")))
+            raise NotNow(why, _seconds(answer.headers.get("Retry-After"), time.time()))
         raise Refused(why)
 
     def _token(self, name: str) -> str:
@@ -161,19 +185,32 @@ class Outbox:
         return token
 
     def _put(self, receiver: Receiver, run: str, data: bytes) -> None:
-        """As a file that appears complete. Raises NotNow."""
+        """As a file that appears complete, and never in place of another. A folder is
+        made before the first result alone: later it may be a share that is away. Raises
+        NotNow, Refused; DaemonError of the database."""
         assert receiver.folder is not None
         folder = self._station.path.parent / receiver.folder
-        path = folder / f"{run}.json"
+        path, partial = folder / f"{run}.json", folder / f".{run}.json.part"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if path.exists():
-                if path.read_bytes() == data:
-                    return
-                raise Refused(f"{path}: there is another result of that name")
-            write_text(path, data.decode())
-        except (OSError, InputError) as e:
-            raise NotNow(str(e)) from e
+            if not folder.is_dir():
+                if self._ledger.has_delivered(receiver.name):
+                    raise NotNow(f"{folder}: there is no such folder any more")
+                folder.mkdir(parents=True, exist_ok=True)
+            partial.unlink(missing_ok=True)  # of a process that was killed
+            with new_file(partial) as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+                _appear(partial, path)
+            synchronise(folder)
+        except FileExistsError as e:
+            if not path.is_file() or path.read_bytes() != data:
+                raise Refused(f"{path}: there is another file of that name") from e
+        except OSError as e:
+            raise NotNow(f"{path}: {e.strerror}") from e
+        finally:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
 
     def _result(self, waiting: Waiting) -> bytes:
         """The `triaxcal.result/1`, from the files of the run: the same bytes each time.
@@ -222,8 +259,45 @@ def _digest(path: Path) -> str | None:
     return found.hexdigest()
 
 
-def _seconds(retry_after: str | None) -> float | None:
-    """Of the header Retry-After, as far as it is a number."""
-    with suppress(TypeError, ValueError):
-        return min(max(0.0, float(str(retry_after))), LONGEST_S)
-    return None
+def _appear(partial: Path, path: Path) -> None:
+    """Give the file its name. Raises FileExistsError where there is one of that name,
+    OSError."""
+    try:
+        os.link(partial, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        if os.path.lexists(path):
+            raise FileExistsError(path) from None
+        os.rename(partial, path)
+
+
+async def _beginning(answer: httpx.Response) -> str:
+    """As much of the answer as is told to people."""
+    data = b""
+    async for block in answer.aiter_raw():
+        data += block
+        if len(data) >= ANSWER_MOST:
+            break
+    return data[:ANSWER_MOST].decode("utf-8", "replace")
+
+
+def _shown(url: str) -> str:
+    """Without what may be secret in it."""
+    with suppress(httpx.InvalidURL):
+        return str(httpx.URL(url).copy_with(username=None, password=None, query=None, fragment=None))
+    return url.partition("?")[0].rpartition("@")[2]
+
+
+def _seconds(retry_after: str | None, now_s: float) -> float | None:
+    """Of the header Retry-After: seconds, or a time of HTTP."""
+    if retry_after is None:
+        return None
+    try:
+        wish_s = float(retry_after)
+    except ValueError:
+        try:
+            wish_s = parsedate_to_datetime(retry_after).timestamp() - now_s
+        except (ValueError, OverflowError):
+            return None
+    return min(max(0.0, wish_s), WISH_MOST_S) if math.isfinite(wish_s) else None

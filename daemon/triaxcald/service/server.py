@@ -149,6 +149,8 @@ async def _serve(
         begun.cancel()
         # The page shows how the runs end; it goes last.
         await service.floor.end()
+        await service.floor.stream.drained()
+        service.floor.stream.close()
         server.should_exit = True
         await asyncio.wait([answering])
 

@@ -68,6 +68,7 @@ class Stream:
         self._idle = asyncio.Event()
         self._idle.set()
         self.seq = 0
+        self._closed = False
         self.trouble: str | None = None
         """Why the latest events are not stored."""
 
@@ -90,6 +91,12 @@ class Stream:
     def live(self, data: Mapping[str, Any]) -> None:
         """Send values that nobody needs later."""
         self._put(Message("live", data))
+
+    def close(self) -> None:
+        """End all listening."""
+        self._closed = True
+        for listener in self._listeners:
+            listener.news.set()
 
     async def drained(self) -> None:
         """Wait until everything is sent."""
@@ -131,7 +138,7 @@ class Stream:
 
     async def listen(self, after: int | None = None) -> AsyncGenerator[Message]:
         """The present state; then the events behind ``after`` if they are kept, else
-        those to come. Raises TooSlow."""
+        those to come, until the stream is closed. Raises TooSlow."""
         listener = _Listener()
         self._listeners.add(listener)
         try:
@@ -140,11 +147,11 @@ class Stream:
             sent = next((m.seq - 1 for m in self._waiting if m.kind == "event" and m.seq is not None), seq)
             yield Message("state", self._state(seq), seq)
             had = seq
-            if after is not None and 0 <= sent - after <= self._kept:
+            if after is not None and 0 <= seq - after <= self._kept:
                 for event in await self._missed(after):
                     if event["seq"] <= sent:
                         yield Message("event", event, event["seq"])
-                had = sent
+                had = max(sent, after)
             while True:
                 while listener.messages:
                     message = listener.messages.popleft()
@@ -152,6 +159,8 @@ class Stream:
                         yield message
                 if listener.too_slow:
                     raise TooSlow
+                if self._closed:
+                    return
                 listener.news.clear()
                 await listener.news.wait()
         finally:

@@ -2,8 +2,8 @@
 `triaxcald.store`; a PostgreSQL server, which several stations share, has a table `run`
 of the same columns.
 
-``home`` is the name of the station in whose folder a run is. Times end in ``_us``
-(microseconds since 1970) or are texts in ISO 8601, UTC.
+``home`` is the station in whose folder a run is: its name, in a file `HERE`. Times end
+in ``_us`` (microseconds since 1970) or are texts in ISO 8601, UTC.
 """
 
 from __future__ import annotations
@@ -22,21 +22,36 @@ from sqlalchemy import (
     MetaData,
     PrimaryKeyConstraint,
     Table,
-    Text,
+    TypeDecorator,
     UniqueConstraint,
 )  # fmt: skip
+from sqlalchemy import Text as SqlText
 
 from triaxcald.schema.columns import COLUMNS, Kind
-from triaxcald.store import OWN_COLUMNS
+from triaxcald.store import TIMES
 
 metadata: Final = MetaData()
+HERE: Final = "."
+"""In place of the station's name in a file, which belongs to one folder."""
+
+
+class Text(TypeDecorator[str]):
+    """Text with a replacement for what not every database can hold: zero bytes, and
+    halves of a surrogate pair."""
+
+    impl = SqlText
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: Any) -> str | None:
+        return None if value is None else value.replace("\0", "\ufffd").encode("utf-8", "replace").decode()
+
 
 _TYPES: Final[dict[Kind, Any]] = {Kind.TEXT: Text, Kind.TEXTS: Text, Kind.WHOLE: BigInteger, Kind.NUMBER: Double}
 
 
 def _of_run() -> list[Column[Any]]:
     cells = [Column(c.name, _TYPES[c.kind], nullable=not c.required) for c in COLUMNS]
-    return [*cells, *(Column(name, BigInteger, nullable=False) for name in OWN_COLUMNS)]
+    return [*cells, *(Column(name, BigInteger, nullable=False) for name in TIMES)]
 
 
 local_run: Final = Table("run", MetaData(), *_of_run(), PrimaryKeyConstraint("outcome"))
@@ -57,6 +72,7 @@ filed: Final = Table(
     Column("run", Text),
     Column("serial", Text),
     Column("plain_serial", Text, index=True),
+    Column("plain_reported", Text, index=True),
     Column("at_us", BigInteger, nullable=False),
     Column("ended_us", BigInteger, nullable=False),
     Column("tried", Boolean, nullable=False),
@@ -64,7 +80,8 @@ filed: Final = Table(
     Column("code", Text),
     PrimaryKeyConstraint("home", "outcome"),
 )  # fmt: skip
-"""Outcomes from which rows of the other tables are made."""
+"""Outcomes from which rows of the other tables are made. ``serial`` is the expected
+serial number, else the reported one, which ``plain_reported`` is of."""
 
 unit: Final = Table(
     "unit", metadata,
@@ -126,8 +143,9 @@ session: Final = Table(
 trail: Final = Table(
     "trail", metadata,
     Column("id", BigInteger().with_variant(Integer, "sqlite"), Identity(), primary_key=True),
+    Column("uid", Text, nullable=False, unique=True),
     Column("time", Text, nullable=False),
-    Column("home", Text, nullable=False),
+    Column("station", Text, nullable=False),
     Column("who", Text),
     Column("role", Text),
     Column("action", Text, nullable=False),
@@ -135,7 +153,8 @@ trail: Final = Table(
     Column("ok", Boolean, nullable=False),
     Column("code", Text),
 )  # fmt: skip
-"""Append-only, by triggers. ``what`` is a JSON object."""
+"""Append-only, by triggers. ``uid`` is also in the line of `trail.jsonl`, ``station``
+is the station's name at the time, ``what`` is a JSON object."""
 
 outbox: Final = Table(
     "outbox", metadata,

@@ -4,9 +4,8 @@ The outcomes are the truth. The table is made from them, and made anew where it 
 missing, damaged or behind them.
 """
 
-from triaxcald.store.database import FILE_NAME
-from triaxcald.store.database import OWN as OWN_COLUMNS
+from triaxcald.store.database import FILE_NAME, TIMES, VERSION
 from triaxcald.store.index import History, Runs, Store
 from triaxcald.store.rows import BESIDE, microseconds
 
-__all__ = ["BESIDE", "FILE_NAME", "OWN_COLUMNS", "History", "Runs", "Store", "microseconds"]
+__all__ = ["BESIDE", "FILE_NAME", "TIMES", "VERSION", "History", "Runs", "Store", "microseconds"]

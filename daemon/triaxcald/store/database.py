@@ -18,6 +18,8 @@ from triaxcald.work import plain_serial
 FILE_NAME: Final = "triaxcal.sqlite"
 DAMAGED: Final = ".damaged"
 """Behind the name of a file that is damaged, or of another program."""
+TABLES: Final = ("file", "run")
+"""What the index has in the file. A service has further tables in it."""
 BUSY_S = 5.0
 """Longest wait for another process. It holds the file for one batch at a time."""
 TIMES: Final = ("at_us", "ended_us", "tried")
@@ -48,6 +50,7 @@ def _outcome_tables() -> tuple[str, ...]:
 MIGRATIONS: Sequence[tuple[str, ...]] = (_outcome_tables(),)
 """Statements that bring the file from each version to the next. The version of a
 file is `PRAGMA user_version`, the number of those that it has had."""
+VERSION: Final = len(MIGRATIONS)
 _UNAVAILABLE = frozenset(
     (
         sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR,
@@ -63,15 +66,20 @@ class _NotOurs(Exception):
 
 
 class Database:
-    """The database of a folder. A damaged file is set aside and made anew. Where there
-    can be no file (a disk that is full or read-only, a file of a later version, another
-    process that holds it) it is in memory until `close`."""
+    """The database of a folder. A damaged file is set aside and made anew; of one that
+    is sound and has the tables of a service, the tables of the index alone are made
+    anew. Where there can be no file (a disk that is full or read-only, a file of a
+    later version, another process that holds it) it is in memory until `close`."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE_NAME
         self._db: sqlite3.Connection | None = None
         self._inode: int | None = None
         self._in_memory = False
+
+    @property
+    def in_memory(self) -> bool:
+        return self._in_memory
 
     @property
     def exists(self) -> bool:
@@ -105,7 +113,7 @@ class Database:
                 if not emptied and self._empty():
                     emptied = True
                     continue
-                if replaced or not self._set_aside():
+                if emptied or replaced or not self._set_aside():
                     self._use_memory(None)
                 replaced = True
 
@@ -160,16 +168,16 @@ class Database:
         a service. False where that cannot be done."""
         try:
             with closing(_connected(self.path)) as db:
-                others = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
-                if self._present_inode() is None or not db.execute(others).fetchone()[0]:
+                if self._present_inode() is None or not has_service(db):
                     return False
                 if db.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
                     return False
                 with transaction(db):
-                    for table in ("file", "run"):
+                    for table in TABLES:
                         db.execute(f"DROP TABLE IF EXISTS {table}")
                     for statement in _outcome_tables():
                         db.execute(statement)
+                    db.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
                 return True
         except (sqlite3.Error, UnicodeDecodeError):
             return False
@@ -180,7 +188,7 @@ class Database:
         _prepare(db)
         if before is not None:
             with suppress(sqlite3.Error, UnicodeDecodeError), transaction(db):
-                for (table,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
+                for table in TABLES:
                     rows = before.execute(f"SELECT * FROM {table}")
                     db.executemany(f"INSERT INTO {table} VALUES ({', '.join('?' * len(rows.description))})", rows)
             before.close()
@@ -199,6 +207,12 @@ def transaction(db: sqlite3.Connection) -> Iterator[None]:
             with suppress(sqlite3.Error):
                 db.execute("ROLLBACK")
         raise
+
+
+def has_service(db: sqlite3.Connection) -> bool:
+    """Whether a service has tables in the file."""
+    query = "SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'"
+    return bool(db.execute(query).fetchone()[0])
 
 
 def _connected(path: Path | str) -> sqlite3.Connection:

@@ -21,7 +21,7 @@ from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
-from triaxcald.store.database import OWN, TIMES, Database, transaction
+from triaxcald.store.database import OWN, TIMES, Database, has_service, transaction
 from triaxcald.store.rows import BESIDE, Cell, NoOutcome, cells_of
 
 BATCH = 500
@@ -156,21 +156,33 @@ class Store:
             return self._database.on(work)
 
     def rows(self, outcomes: Sequence[str]) -> list[dict[str, Cell]]:
-        """The rows of these outcomes as they were last read, with all columns of the
-        index."""
+        """The rows of these outcomes as they were last read, with the times of the
+        index. Files are named whether they are in the folder or not."""
 
         def work(db: sqlite3.Connection) -> list[dict[str, Cell]]:
             marks = ", ".join("?" * len(outcomes))
             found = db.execute(f"SELECT * FROM run WHERE outcome IN ({marks})", tuple(outcomes)).fetchall()
-            return [dict(zip((*NAMES, *OWN), (*self._present(row), *row[len(NAMES) :]), strict=True)) for row in found]
+            return [dict(zip((*NAMES, *TIMES), _checked(row), strict=True)) for row in found]
 
         with self._lock:
             return self._database.on(work)
 
-    def make(self) -> None:
-        """Make the file of the index, also in a folder without an outcome."""
+    def make(self) -> bool:
+        """Make the file of the index, also in a folder without an outcome, and check
+        it. False where there can be none, and the index is in memory."""
         with self._lock:
             self._database.on(lambda _: None)
+            return not self._database.in_memory
+
+    def has_service(self) -> bool:
+        """Whether the file also has the tables of a service."""
+        with self._lock:
+            return self._database.exists and self._database.on(has_service)
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether there could be no file. The next call after `close` tries again."""
+        return self._database.in_memory
 
     def forget(self) -> None:
         """Forget all outcomes: the next look at the folder reads them anew."""
@@ -181,14 +193,13 @@ class Store:
                 db.execute("DELETE FROM run")
 
         with self._lock:
-            self._database.on(work)
+            if self._database.exists:
+                self._database.on(work)
 
     def _present(self, row: Cells) -> Cells:
         """The cells of `NAMES`, without names of files that are not in the folder.
         Raises sqlite3.DatabaseError where a cell is not as it was written."""
-        *held, check = row
-        if check != _check(held):
-            raise sqlite3.DatabaseError("a row was changed")
+        held = _checked(row)
         for i in _BESIDE:
             if held[i] not in self._names:
                 held[i] = None
@@ -277,6 +288,15 @@ class Store:
             return None
         row = [cells[column] for column in (*NAMES, *TIMES)]
         return (*row, _check(row))
+
+
+def _checked(row: Cells) -> list[Cell]:
+    """The cells without their check sum. Raises sqlite3.DatabaseError where one is not
+    as it was written."""
+    *held, check = row
+    if check != _check(held):
+        raise sqlite3.DatabaseError("a row was changed")
+    return held
 
 
 def _check(cells: Sequence[Cell]) -> int:

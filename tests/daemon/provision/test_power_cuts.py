@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -141,3 +142,28 @@ async def test_a_unit_that_takes_the_place_of_another_at_any_request_is_not_give
             assert state != "new_unverified" or host.starts_with() == "new", request
         if state in ("old", "untouched"):
             assert host.starts_with() == "old", request
+
+
+@pytest.mark.parametrize("kill_after", [False, True])
+async def test_a_probe_that_a_killed_process_leaves_in_use_is_in_a_journal(tmp_path: Path, kill_after: bool) -> None:
+    """The device holds the calibration already, so that nothing but a probe is written."""
+    held = 0
+    for request in range(1, 500):
+        host = Host(tmp_path / str(request), Habits())
+        assert await host.provision()
+        assert host.journals == []
+        if await host.provision(request, kill_after=kill_after):
+            assert host.journals == []
+            break
+        probed = host.unit.in_use != host.unit.eeprom
+        held += probed
+        steps = [json.loads(path.read_text())["step"] for path in host.journals]
+        assert steps == ["probing"] or not (probed or steps), (request, steps)
+        assert host.starts_with() == "new"
+        if steps:
+            assert await getattr(host, ["resume", "provision", "restore"][request % 3])(), request
+        assert host.unit.in_use == host.unit.eeprom == host.new
+        assert host.journals == []
+    else:
+        pytest.fail("no process came to its end")
+    assert held > 1

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -197,24 +198,20 @@ async def test_people_and_tokens_are_in_either_database(station: Path, run: Run,
 
 def at_terminal(station: Path, *typed: bytes) -> tuple[int, bytes]:
     """Exit code and what a terminal shows while someone types."""
-    process, terminal = pty.fork()
-    if process == 0:  # pragma: no cover - another process
-        os.execv(
-            sys.executable,
-            [sys.executable, "-m", "triaxcald.cli", "people", "add", "Ada", "--role", "operator", "--station",
-             str(station)],
-        )  # fmt: skip
-    shown, answers = b"", list(typed)
-    while True:
-        try:
-            shown += os.read(terminal, 4096)
-        except OSError:
-            break
-        if answers and shown.rstrip().endswith(b":"):
-            os.write(terminal, answers.pop(0))
-            shown += b"\n"
-    os.close(terminal)
-    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), shown
+    program = [sys.executable, "-m", "triaxcald.cli", "people", "add", "Ada", "--role", "operator", "--station"]
+    terminal, other_end = pty.openpty()
+    with subprocess.Popen(
+        [*program, str(station)], stdin=other_end, stdout=other_end, stderr=other_end, start_new_session=True
+    ) as process:
+        os.close(other_end)
+        shown, answers = b"", list(typed)
+        with suppress(OSError):  # the other end is closed
+            while data := os.read(terminal, 4096):
+                shown += data
+                if answers and shown.endswith((b"Ada: ", b"again: ")):
+                    os.write(terminal, answers.pop(0))
+        os.close(terminal)
+    return process.returncode, shown
 
 
 def test_a_pin_that_is_typed_is_not_shown(station: Path) -> None:

@@ -290,6 +290,19 @@ async def test_what_is_no_http_is_refused_with_a_row(service: Guarded) -> None:
     assert "connection" in {row["action"] for row in service.rows()}
 
 
+async def test_a_body_that_is_no_http_is_answered_once_and_fills_no_log(
+    service: Guarded, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also where the request is refused for another reason at the same time, without a row that takes time."""
+    monkeypatch.setattr("triaxcald.service.access.REFUSALS_MOST", 0)
+    for host in ("127.0.0.1", "evil.example"):
+        head = f"POST /api/1/scan HTTP/1.1\r\nHost: {host}:{service.port}\r\nContent-Type: application/json\r\n"
+        status, document = await raw(service, head.encode() + b"Transfer-Encoding: chunked\r\n\r\nno length\r\n")
+        assert (status, document["code"]) == (400, "invalid")
+    await still_works(service)
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 # TLS.
 
 

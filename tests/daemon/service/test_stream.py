@@ -1,0 +1,144 @@
+"""The events of a station: each stored before it is sent, resumed by number, ended in order."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import aclosing, asynccontextmanager, suppress
+from typing import Any
+
+import pytest
+
+from triaxcald.service.database import DatabaseError
+from triaxcald.service.ledger import Ledger
+from triaxcald.service.stream import LISTENER_MOST, Message, Stream, TooSlow
+from triaxcald.station.config import Station
+
+
+@pytest.fixture
+def ledger(make_station: Callable[..., Station], open_ledger: Callable[[Station], Ledger]) -> Ledger:
+    return open_ledger(make_station())
+
+
+@asynccontextmanager
+async def flowing(ledger: Any) -> AsyncIterator[Stream]:
+    stream = Stream(ledger, lambda seq: {"seq": seq})
+    await stream.begin()
+    running = asyncio.ensure_future(stream.run())
+    try:
+        yield stream
+    finally:
+        running.cancel()
+        with suppress(asyncio.CancelledError):
+            await running
+
+
+def emit(stream: Stream, count: int) -> None:
+    for _ in range(count):
+        number = stream.number()
+        stream.emit({"seq": number, "run": None, "event": "stage"})
+
+
+async def heard(stream: Stream, count: int, after: int | None = None) -> list[tuple[str, int | None]]:
+    async with aclosing(stream.listen(after)) as messages:
+        found: list[Message] = []
+        async for message in messages:
+            found.append(message)
+            if len(found) == count:
+                break
+    return [(m.kind, m.seq) for m in found]
+
+
+async def test_a_listener_gets_the_state_and_then_what_comes(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream:
+        emit(stream, 2)
+        await stream.drained()
+        listening = asyncio.ensure_future(heard(stream, 4))
+        while not stream.listeners:
+            await asyncio.sleep(0)
+        emit(stream, 2)
+        stream.changed()
+        assert await listening == [("state", 2), ("event", 3), ("event", 4), ("state", 4)]
+        assert [e["seq"] for e in ledger.events_after(0, 10)] == [1, 2, 3, 4]
+
+
+async def test_one_that_comes_again_gets_what_it_missed_once(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream:
+        emit(stream, 5)  # some of them wait to be stored
+        assert await heard(stream, 4, after=2) == [("state", 5), ("event", 3), ("event", 4), ("event", 5)]
+        await stream.drained()
+        assert await heard(stream, 3, after=3) == [("state", 5), ("event", 4), ("event", 5)]
+
+
+@pytest.mark.parametrize("after", [0, 99])
+async def test_a_number_that_is_not_kept_gives_the_state_alone(ledger: Ledger, after: int) -> None:
+    async with flowing(ledger) as stream:
+        stream._kept = 3
+        emit(stream, 5)
+        await stream.drained()
+        listening = asyncio.ensure_future(heard(stream, 2, after=after))
+        while not stream.listeners:
+            await asyncio.sleep(0)
+        emit(stream, 1)
+        assert await listening == [("state", 5), ("event", 6)]
+
+
+async def test_numbers_go_on_after_a_restart(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream:
+        emit(stream, 3)
+        await stream.drained()
+    async with flowing(ledger) as stream:
+        assert stream.number() == 4
+
+
+async def test_what_waits_at_the_end_is_stored(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream:
+        await asyncio.sleep(0)
+        emit(stream, 3)
+    assert ledger.last_seq() == 3
+
+
+async def test_a_listener_that_does_not_read_is_let_go(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream, aclosing(stream.listen()) as messages:
+        await anext(messages)
+        for _ in range(LISTENER_MOST + 1):
+            stream.live({})
+        await stream.drained()
+        with pytest.raises(TooSlow):
+            async for _ in messages:
+                pass
+    assert stream.listeners == 0
+
+
+async def test_listening_ends_with_the_stream(ledger: Ledger) -> None:
+    async with flowing(ledger) as stream:
+        listening = asyncio.ensure_future(heard(stream, 9))
+        while not stream.listeners:
+            await asyncio.sleep(0)
+        emit(stream, 1)
+        await stream.drained()
+        stream.close()
+        assert await listening == [("state", 0), ("event", 1)]
+
+
+class Broken:
+    """A database that fails."""
+
+    def append(self, events: list[dict[str, Any]]) -> None:
+        raise DatabaseError("no space")
+
+    def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]:
+        raise DatabaseError("no space")
+
+    def last_seq(self) -> int:
+        return 7
+
+
+async def test_events_go_on_while_the_database_fails() -> None:
+    async with flowing(Broken()) as stream:
+        listening = asyncio.ensure_future(heard(stream, 2, after=6))
+        while not stream.listeners:
+            await asyncio.sleep(0)
+        emit(stream, 1)
+        assert await listening == [("state", 7), ("event", 8)]
+        assert stream.trouble == "no space"
