@@ -36,7 +36,8 @@ function reasons(q) {
 
 function ppk(c) {
   if (c.low === null && c.high === null) return word("quality.ppk_no_limit");
-  if (c.ppk === null) return word("quality.ppk_few", { least: PPK_LEAST });
+  if (c.n < PPK_LEAST) return word("quality.ppk_few", { least: PPK_LEAST });
+  if (c.ppk === null) return "–";
   const [low, high] = c.ppk_interval;
   return `${figure(c.ppk, 3)} (${figure(low, 3)}–${figure(high, 3)})`;
 }
