@@ -39,7 +39,7 @@ def main() -> None:
                 while not found():
                     time.sleep(0.2)
                 browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
-                page = browser.new_page(viewport={"width": 1440, "height": 810}, color_scheme="light")
+                page = browser.new_page(viewport={"width": 1600, "height": 1000}, color_scheme="light")
                 page.goto(f"http://127.0.0.1:{PORT}/")
                 while found() < POSES:
                     time.sleep(0.05)

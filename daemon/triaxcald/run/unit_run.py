@@ -41,7 +41,7 @@ from triaxcald.outcome import (
 )
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.journal import Owner, journals_of, open_journal
-from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.procedure import Provisioning, to_its_end
 from triaxcald.provision.registers import RegisterImage, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.raw_to_poses import Pipeline
@@ -51,7 +51,7 @@ from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.orders import require_allowed, require_serial
 from triaxcald.run.session import UnitSession
-from triaxcald.run.together import side_by_side
+from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.run.tray_progress import TrayProgress
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.schema.codes import Stage
@@ -179,7 +179,7 @@ class UnitRun(UnitSession):
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
                     ending = await self._ending(device, identity, writer)
-                    self._finalize(writer, ending)
+                    await _at_the_disk(partial(self._finalize, writer, ending))
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             if self._document is None:  # a stored outcome is final
                 ending = self._aborted(e)
@@ -189,14 +189,14 @@ class UnitRun(UnitSession):
         assert ending is not None
         written = True
         try:
-            self._write_artifacts()
+            await _at_the_disk(self._write_artifacts)
         except InputError as e:
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
             code = ending.code if ending.exit_code else Code.DISK
             ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
             written = False
         if self._attempt_file is not None:
-            self._leave(self._attempt_file, written)
+            await _at_the_disk(partial(self._leave, self._attempt_file, written))
         return self._outcome(ending)
 
     def _leave(self, file: AttemptFile, written: bool) -> None:
@@ -446,7 +446,7 @@ class UnitRun(UnitSession):
             wanted = plan.poses if self.rezero is None else plan.rezero_poses
             await self._collect(reconnecting, writer, acquisition, td.READINGS, wanted)
         self.progress.stage(self.name, Stage.FITTING)
-        poses = acquisition.pipelines[td.READINGS].finish()
+        poses = await asyncio.to_thread(acquisition.pipelines[td.READINGS].finish)
         certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
             await self._write(device, writer, certified.image, identity, acquisition)
@@ -569,6 +569,12 @@ class UnitRun(UnitSession):
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:
         back = self._write_back
         return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
+
+
+async def _at_the_disk(work: Callable[[], None]) -> None:
+    """Do ``work`` on a thread, to its end: a slow disk holds up no other unit, and
+    nothing leaves half of a document."""
+    await to_its_end(whole_on_a_thread(work))
 
 
 @dataclass

@@ -54,9 +54,10 @@ def now() -> str:
 
 
 class Floor:
-    """``load`` reads the station file again. ``log`` takes a line for people,
-    ``recorded`` is called after runs have entered the database. All methods are called
-    in the event loop; those that take something from people raise ApiError."""
+    """``load`` reads the station file again, ``loaded`` receives the new station.
+    ``log`` takes a line for people, ``recorded`` is called after runs have entered the
+    database. All methods are called in the event loop; those that take something from
+    people raise ApiError."""
 
     def __init__(
         self,
@@ -67,8 +68,10 @@ class Floor:
         load: Callable[[], Station],
         log: Callable[[str], None],
         recorded: Callable[[], None] = lambda: None,
+        loaded: Callable[[Station], None] = lambda _: None,
     ) -> None:
         self.station, self._book, self._load, self._log, self._recorded = station, book, load, log, recorded
+        self._loaded = loaded
         self.desk = _desk_of(station)
         self.stream = stream(self.state)
         self._tray: TrayRun | None = None
@@ -313,6 +316,7 @@ class Floor:
         kept = self.desk.kept()
         self.station, self.desk = station, _desk_of(station)
         self.desk.restore(kept, now())
+        self._loaded(station)
         self._log(f"{station.path}: loaded again")
         await self._changed()
 

@@ -101,9 +101,16 @@ async def _working(
     """A service whose events are stored and whose results are delivered."""
     outbox = Outbox(ledger, station, log)
     access = Access(ledger, station, secure=address.secure, hosts=hosts, log=log)
+
+    def loaded(again: Station) -> None:
+        access.station = again
+        ledger.receive(again)
+        outbox.receive(again)
+        outbox.news()
+
     floor = Floor(
         station, ledger, partial(Stream, ledger), load=partial(load_station, station.path), log=log,
-        recorded=outbox.news,
+        recorded=outbox.news, loaded=loaded,
     )  # fmt: skip
     service = StationService(floor, ledger, access, outbox)
     await asyncio.to_thread(ledger.begin_deliveries)
