@@ -23,6 +23,20 @@ def scan(page: Page, *texts: str) -> None:
         page.keyboard.press("Enter")
 
 
+def burst(page: Page, text: str) -> None:
+    """The same without a pause that a busy computer might make between two keys."""
+    page.evaluate(
+        """text => {
+          const field = document.activeElement;
+          for (const key of [...text, "Enter"]) {
+            field.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+            if (key !== "Enter") field.value += key;
+          }
+        }""",
+        text,
+    )
+
+
 def task(page: Page) -> str:
     return page.locator("#task-title").inner_text()
 
@@ -160,7 +174,8 @@ def test_a_missing_reason_is_asked_for_and_starts_the_tray(stage: Stage, opened:
     scan(page, "CMD:START")
     dialog = page.locator("#retest-dialog")
     expect(dialog).to_be_visible()
-    scan(page, "WO:4712")  # a scan while it is asked is a scan
+    expect(page.locator("#retest-reason")).to_be_focused()
+    burst(page, "WO:4712")  # a scan while it is asked is a scan
     expect(page.locator("#work")).to_contain_text("4712")
     expect(page.locator("#retest-reason")).to_have_value("")
     page.locator("#retest-reason").press_sequentially("customer return", delay=90)
@@ -277,6 +292,19 @@ def test_nothing_is_wider_than_the_page(stage: Stage, opened: Opened, size: tupl
         ".card", "all => all.map(c => [c.querySelector('.big b'), c].map(e => e.getBoundingClientRect().right))"
     )
     assert [right for right, edge in cards if right > edge] == []
+
+
+@pytest.mark.parametrize("language", ["en", "de", "uk"])
+@pytest.mark.parametrize("size", [(1920, 1080), (1280, 720), (1180, 820), (820, 1180)])
+def test_four_slots_at_work_are_in_sight_without_scrolling(
+    stage: Stage, opened: Opened, size: tuple[int, int], language: str
+) -> None:
+    in_poses(stage)
+    page = opened(f"/?lang={language}", viewport={"width": size[0], "height": size[1]})
+    expect(page.locator(".card .count")).to_have_count(4)
+    stage.live({slot: direction(3, 3, [0.0, 0.0, 1.0], 1.5) for slot in "abcd"})
+    expect(page.locator(".sphere")).to_have_count(4)
+    assert page.evaluate("document.documentElement.scrollHeight") <= size[1]
 
 
 def test_a_service_that_hangs_greys_the_page_within_5_s(stage: Stage, opened: Opened) -> None:
