@@ -18,8 +18,11 @@ from triaxcal_drivers.catalogue import BUILT_IN
 from triaxcald.audit import audit
 from triaxcald.audit.conduct import Result
 from triaxcald.recording.reader import Recording
+from triaxcald.run.attempts import Attempts, settle_killed
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.run import Run
+from triaxcald.station.config import load_station
+from triaxcald.work import Attempt, Work
 
 GOLDEN, OTHER = "4711", "4713"
 PLAN = {"poses": 9, "hold_s": 1.0, "check_poses": 4}
@@ -225,3 +228,59 @@ def test_a_calibration_that_is_none_is_refused_at_the_start(
         file.write_text(json.dumps({**document, "unit": {"serial": "1"}}))
         triaxcal("run", station).failed(2, where, "is of the unit with serial 1, not of 4711")
     assert not list(workshop.folder.glob("*.mcap"))
+
+
+def test_a_golden_unit_that_is_not_held_still_is_no_verification(
+    bench: Callable[..., Any], workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    calibration(workshop.folder)
+    with bench(plan={**PLAN, "hold_s": 30.0, "patience_s": 20.0}) as station:
+        done = triaxcal("run", station, "--serial", f"a={GOLDEN}", "--json")
+    assert done.code == 3
+    outcome = done.json["units"][0]["outcome"]
+    assert (outcome["code"], outcome["verification"], outcome["device_state"]) == ("no_poses", None, "untouched")
+    assert triaxcal("audit", done.json["units"][0]["recording"]).code == 0
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_golden_run_that_was_killed_is_audited(
+    verified: Path, tmp_path: Path, triaxcal: Callable[..., Any], share: float
+) -> None:
+    """Its recording is cut off, as a killed process leaves it."""
+    with Recording.open(verified) as recording:
+        told, work = recording.metadata["run"], Work.recorded(recording.metadata["work"])
+        (tmp_path / "station.toml").write_bytes(recording.attachments["station.toml"])
+    tray = Attempts(tmp_path, "0193f0e4-0000-7000-8000-00000000000f", "bench", {"verification_rms_g": LIMIT_G})
+    (tmp_path / "running").mkdir()
+    file = tray.begin(Attempt(told["run"], told["started"], work, verified.name))
+    file.serial = GOLDEN  # which the unit had told
+    file.write()
+    whole = verified.read_bytes()
+    (tmp_path / verified.name).write_bytes(whole[: round(share * len(whole))])
+    (killed,) = settle_killed(load_station(tmp_path / "station.toml"))
+    assert (killed.document["code"], killed.document["verification"]) == ("killed", None)
+    assert triaxcal("audit", tmp_path / verified.name).code == 0
+
+
+@pytest.mark.slow
+def test_beside_other_units_on_one_fixture_it_is_verified_while_they_are_calibrated(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    calibration(workshop.folder)
+    buses = {slot: {"host": "127.0.0.1", "port": port} for slot, port in (("a", 502), ("b", 503))}
+    devices = [
+        described(workshop.device(f"{serial}.toml", bus=BUS, sensor=EXACT, serial=serial, seed=serial))
+        for serial in (4711, 4713)
+    ]
+    station = workshop.station(
+        {"name": "a", "serial": GOLDEN, "bus": buses["a"]}, {"name": "b", "serial": OTHER, "bus": buses["b"]},
+        plan={**PLAN, "poses": 14}, limits={"verification_rms_g": LIMIT_G}, fixture={"together": True},
+        rules={"golden": {"serial": GOLDEN, "every_h": 8, "calibration": "golden.json"}},
+    )  # fmt: skip
+    with virtual_line(*devices):
+        done = triaxcal("run", station, "--json")
+    assert done.code == 0, done.err
+    golden, other = (unit["outcome"] for unit in done.json["units"])
+    assert (golden["device_state"], golden["measured"]) == ("untouched", None)
+    assert other["device_state"] == "new_verified"
+    assert [golden["code"], other["code"]] == ["within_limits"] * 2
