@@ -49,11 +49,14 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
+from triaxcald.run.golden_unit import ATTACHMENT as GOLDEN_FILE
+from triaxcald.run.golden_unit import RECORD as GOLDEN_RECORD
+from triaxcald.run.golden_unit import GoldenCheck, check_directions, require_trusted
 from triaxcald.run.orders import require_allowed, require_serial
 from triaxcald.run.session import UnitSession
 from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.run.tray_progress import TrayProgress
-from triaxcald.run.write_back import WriteBack, corrected
+from triaxcald.run.write_back import VERIFICATION_FILE, WriteBack, corrected
 from triaxcald.schema.codes import Stage
 from triaxcald.software import new_run_id, software
 from triaxcald.station.collection import Collection, Progress
@@ -99,7 +102,7 @@ class Outcome:
 
 
 class UnitRun(UnitSession):
-    """The whole line for one unit of a station.
+    """The whole line for one unit of a station. The golden unit is verified alone.
 
     ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
     the active units of the station. ``rezero`` is a calibration whose biases alone
@@ -145,6 +148,8 @@ class UnitRun(UnitSession):
         self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
+        self._golden: GoldenCheck | None = None
+        self._golden_verification: tc.interchange.Document | None = None
         self._document: tc.interchange.Document | None = None
         self._lost = 0
 
@@ -169,6 +174,7 @@ class UnitRun(UnitSession):
                 identity = await self.identify(device)
                 await self._identified(identity)
                 path = unused(self.recording_path(identity))
+                self._golden = await self._golden_check(identity)
                 if self.rezero is not None:
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
@@ -178,6 +184,8 @@ class UnitRun(UnitSession):
                     self._recording = path
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
+                    if self._golden is not None and self._golden.file is not None:
+                        writer.attach(GOLDEN_FILE, "application/json", self._golden.file.data)
                     ending = await self._ending(device, identity, writer)
                     await _at_the_disk(partial(self._finalize, writer, ending))
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
@@ -273,21 +281,24 @@ class UnitRun(UnitSession):
 
     @property
     def _records(self) -> dict[str, dict[str, str]]:
-        """Metadata of the recording: the run, its work, and the earlier calibration of
-        a rezero."""
+        """Metadata of the recording: the run, its work, the earlier calibration of a
+        rezero, and how a golden unit is verified."""
         attempt = self._attempt
         return {
             RUN_RECORD: {"run": attempt.run, "started": attempt.started},
             WORK_RECORD: attempt.work.record(),
             **self._rezero_record,
+            **({} if self._golden is None else {GOLDEN_RECORD: self._golden.record}),
         }
 
     async def _ending(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
+            if self._golden is not None:
+                return await self._verify_golden(device, identity, writer, self._golden)
             return await self._line(device, identity, writer)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording still gets its outcome
             if self._confirmation is not None and self._confirmation.unconfirmed:
-                self._certified = None  # its records may be another unit's
+                self._certified, self._golden_verification = None, None  # its records may be another unit's
             ending = self._aborted(e)
             with suppress(RecordingError):
                 writer.event("failed", {"error": ending.reason})
@@ -338,7 +349,7 @@ class UnitRun(UnitSession):
             if contents is None
             else Papers(
                 measured=measured_in(certificate) if certificate else None,
-                verification=back.verification if back else None,
+                verification=self._verification,
                 registers=registers_told(back.provisioning) if back and back.provisioning else None,
                 limits=limits,
                 outside=certificate["outside"] if certificate else (),
@@ -355,6 +366,10 @@ class UnitRun(UnitSession):
             forced=self.force if back and back.warnings else None,
             attempt=replace(self._attempt, recording=self._recording.name if self._recording else None),
         )
+
+    @property
+    def _verification(self) -> tc.interchange.Document | None:
+        return self._write_back.verification if self._write_back else self._golden_verification
 
     @property
     def _journal(self) -> str | None:
@@ -402,7 +417,7 @@ class UnitRun(UnitSession):
             report=self._paths.get(REPORT),
             outcome=self._paths.get(ATTACHMENT),
             certified=self._certified,
-            verification=back.verification if back else None,
+            verification=self._verification,
             provisioned=back.provisioning if back else None,
             device_state=state,
             recovery_command=self._recovery_command,
@@ -425,7 +440,7 @@ class UnitRun(UnitSession):
     async def _require_readings_before(self, device: td.Device) -> None:
         """Check, before any pose is taken, that the registers state their readings.
         Raises Refused, DriverError."""
-        written = self.station.file.provisioning.write and why_not_written(self.profile) is None
+        written = self.station.file.provisioning.write and why_not_written(self.profile) is None and not self._golden
         if written and leaves_open(self.profile):
             with suppress(td.RegisterRefused):  # an unreadable register is not written either
                 require_readings_before(self.profile, await self.registers(device))
@@ -433,6 +448,37 @@ class UnitRun(UnitSession):
     @property
     def _rezero_record(self) -> dict[str, dict[str, str]]:
         return {} if self.rezero is None else {RECORD: {"calibration": self.rezero.name}}
+
+    async def _golden_check(self, identity: IdentityRead) -> GoldenCheck | None:
+        """How the unit is verified, None if it is not the golden one. Raises
+        InputError, Refused."""
+        serial = identity.serial or self._attempt.work.serial
+        golden = await asyncio.to_thread(GoldenCheck.at_place, self.station, self.place, serial)
+        if golden is not None and self.rezero is not None:
+            raise InputError(
+                f"unit {self.name}: serial number {serial} is the golden unit, which is verified and keeps its biases; "
+                "give no --rezero for it"
+            )
+        return golden
+
+    async def _verify_golden(
+        self, device: td.Device, identity: IdentityRead, writer: RecordingWriter, golden: GoldenCheck
+    ) -> Ending:
+        """Verify the golden unit in check poses. Nothing is written to it."""
+        plan = self.station.file.plan
+        check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
+        self._acquisition = check
+        self._confirmation = self.confirmation(device, identity, writer, check)
+        policy = RetryPolicy(plan.comes_back_s, others=self.others)
+        reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
+        async with self._confirmation.phase():
+            self.progress.stage(self.name, Stage.CHECK_POSES)
+            await self._collect(reconnecting, writer, check, golden.stream, plan.check_poses)
+        found = await asyncio.to_thread(golden.verify, check.pipelines)
+        document = self._golden_verification = golden.document(found, check.digest.hexdigest())
+        writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
+        require_trusted(found.poses)
+        return golden.ending(document)
 
     async def _line(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
@@ -534,6 +580,8 @@ class UnitRun(UnitSession):
         plan, targets = self.station.file.plan, None
         if self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
+        if self._golden is not None:
+            plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
         if self.tray is not None:
             targets = (
                 self.tray.targets(self.name, targets or tc.planning.directions(wanted))

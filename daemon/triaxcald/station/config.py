@@ -120,10 +120,10 @@ WorkText = Annotated[str, AfterValidator(_work_text)]
 
 
 class Golden(td.Strict):
-    """A unit that is measured from time to time to check the station itself."""
+    """A unit that is verified from time to time to check the station itself."""
 
     serial: WorkText
-    every_h: Annotated[float, Field(gt=0, description="it is due so long after it was last measured")]
+    every_h: Annotated[float, Field(gt=0, description="it is due in each slot so long after it last verified there")]
     calibration: Annotated[
         PathText, Field(description="the calibration that it is known to have, beside the station file")
     ]
@@ -142,6 +142,10 @@ class Rules(td.Strict):
         False
     )
     golden: Golden | None = None
+
+    def of_golden(self, serial: str | None) -> bool:
+        """Whether this is the serial number of the golden unit."""
+        return self.golden is not None and serial is not None and same_serial(self.golden.serial, serial)
 
     @field_validator("serial")
     @classmethod
@@ -282,6 +286,12 @@ class StationFile(td.Strict):
             raise ValueError("latitude_deg and height_m: give both, or neither")
         if self.latitude_deg is not None and self.given_reference is not None:
             raise ValueError("reference: latitude_deg and height_m say it already; give one or the other")
+        return self
+
+    @model_validator(mode="after")
+    def _golden_is_judged(self) -> Self:
+        if self.rules.golden is not None and self.limits.verification_rms_g is None:
+            raise ValueError("rules.golden: give limits.verification_rms_g too, by which the golden unit is judged")
         return self
 
     @model_validator(mode="after")
@@ -441,7 +451,8 @@ def load_station(path: Path) -> Station:
         bundle = bundles[unit.profile]
         driver = td.driver_named(bundle.profile.driver, where=str(path))
         bus = td.toml_text.validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
-        if file.limits.verification_rms_g is not None and td.CORRECTED not in bundle.profile.streams:
+        judged = file.limits.verification_rms_g is not None and file.rules.golden is None  # which needs the limit too
+        if judged and td.CORRECTED not in bundle.profile.streams:
             raise InputError(
                 f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
             )

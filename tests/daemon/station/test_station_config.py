@@ -143,6 +143,7 @@ def _tray(tmp_path: Path, old: str = "", new: str = "") -> Path:
     text = GOOD.replace('serial = "4711"', 'serial = "4711"\nmounting = "-y+x+z"').replace(
         "[[units]]", f"{TRAY}\n[[units]]", 1
     )
+    text = text.replace("\nrms_g = 5e-5", "\nverification_rms_g = 5e-5", 1)  # by which the golden unit is judged
     assert old in text
     path = tmp_path / "station.toml"
     path.write_text(text.replace(old, new, 1))
@@ -201,6 +202,7 @@ def test_fixture_rules_and_work_are_read(tmp_path: Path) -> None:
         ("every_h = 24", "every_h = 0", "line 19: rules.golden.every_h: input should be greater than 0, not 0"),
         ('serial = "0001"', 'serial = ""', "line 19: rules.golden.serial: expected 1 to 64 characters, not ''"),
         (', calibration = "golden.json"', "", "line 19: rules.golden.calibration: missing"),
+        ("verification_rms_g", "rms_g", "rules.golden: give limits.verification_rms_g too, by which the golden unit"),
         ('"Ada"', '""', "line 22: work.operator: expected 1 to 64 characters, not ''"),
         ('"Ada"', f'"{65 * "a"}"', "line 22: work.operator: expected 1 to 64 characters, not 'aaaa"),
         ('"Ada"', '"A\\u0007da"', "line 22: work.operator: expected printable characters alone"),
@@ -214,7 +216,7 @@ def test_a_fault_of_fixture_rules_or_work_is_said_with_file_line_and_key(
     with pytest.raises((InputError, DriverError)) as caught:
         load_station(path)
     message = str(caught.value)
-    assert message.startswith(f"{path}, {words}")
+    assert message.startswith((f"{path}, {words}", f"{path}: {words}"))
     assert "\n" not in message
 
 
