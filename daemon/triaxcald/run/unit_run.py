@@ -7,7 +7,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Generator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,7 @@ from triaxcald.schema.codes import Stage
 from triaxcald.software import new_run_id, software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
+from triaxcald.station.on_demand import Judge, Judgement, OnDemand
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.station.tray import Tray
@@ -489,7 +490,7 @@ class UnitRun(UnitSession):
         reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             self.progress.stage(self.name, Stage.POSES)
-            wanted = plan.poses if self.rezero is None else plan.rezero_poses
+            wanted = plan.poses_most if self.rezero is None else plan.rezero_poses
             await self._collect(reconnecting, writer, acquisition, td.READINGS, wanted)
         self.progress.stage(self.name, Stage.FITTING)
         poses = await asyncio.to_thread(acquisition.pipelines[td.READINGS].finish)
@@ -577,8 +578,12 @@ class UnitRun(UnitSession):
         wanted: int,
         apart_from: tc.Floats | None = None,
     ) -> None:
-        plan, targets = self.station.file.plan, None
-        if self.rezero is not None and stream == td.READINGS:
+        plan, targets, on_demand = self.station.file.plan, None, None
+        if self.rezero is None and stream == td.READINGS and plan.stop is not None:
+            judge = Judge.of(plan.stop, self.place, self.station.file)
+            on_demand = OnDemand(judge, repeat=plan.repeat, tell=partial(self._judged, writer))
+            targets = on_demand.targets
+        elif self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
         if self._golden is not None:
             plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
@@ -598,7 +603,14 @@ class UnitRun(UnitSession):
             nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == td.READINGS else (1, 1, 1),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
+            on_demand=on_demand,
         )
+
+    @staticmethod
+    def _judged(writer: RecordingWriter | None, found: int, judgement: Judgement) -> None:
+        """Note in the recording why the poses on demand went on, or ended."""
+        if writer is not None:
+            writer.event("poses_judged", {"found": found, **asdict(judgement)})
 
     async def check(self) -> Verification:
         """Verify the device's own corrected output in check poses; records and writes

@@ -439,3 +439,53 @@ def test_as_many_poses_as_a_sphere_has_room_for_are_allowed(
     else:
         with pytest.raises(DriverError, match=r"plan\.poses: there are not so many directions 60 degrees apart"):
             load_station(path)
+
+
+STOP = "stop = { uncertainty_g = 3e-5, poses_least = 10, poses_most = 20 }"
+
+
+def test_poses_on_demand_are_in_place_of_poses(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace("poses = 14", STOP, 1))
+    plan = load_station(path).file.plan
+    assert plan.stop is not None
+    assert (plan.stop.uncertainty_g, plan.stop.poses_least, plan.poses_most) == (3e-5, 10, 20)
+    path.write_text(GOOD.replace("poses = 14", "stop = { uncertainty_g = 3e-5 }", 1))
+    stop = load_station(path).file.plan.stop
+    assert stop is not None
+    assert (stop.poses_least, stop.poses_most) == (9, 26)
+    path.write_text(GOOD)
+    assert load_station(path).file.plan.poses_most == 14
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (f"poses = 14\n{STOP}", "plan: poses and stop: give one or the other"),
+        ("stop = {}", "plan.stop.uncertainty_g: missing"),
+        ("stop = { uncertainty_g = 0.0 }", "plan.stop.uncertainty_g: input should be greater than 0"),
+        ("stop = { uncertainty_g = 1e-5, poses_least = 8 }", "plan.stop.poses_least: input should be greater"),
+        ("stop = { uncertainty_g = 1e-5, poses_most = 1001 }", "plan.stop.poses_most: input should be less"),
+        ("stop = { uncertainty_g = 1e-5, poses_least = 27 }", "poses_least: 27 is above poses_most, 26"),
+        ("stop = { uncertainty_g = 1e-5, poses = 9 }", "plan.stop.poses: unknown key"),
+        (f"{STOP}\napart_deg = 60.0", "plan.stop.poses_most: there are not so many directions 60 degrees apart"),
+    ],
+)
+def test_a_fault_of_poses_on_demand_is_one_line(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace("poses = 14", line, 1))
+    with pytest.raises(DriverError) as caught:
+        load_station(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["reference_uncertainty = 3e-5", "latitude_deg = 50.0\nheight_m = 100.0"])
+def test_an_uncertainty_below_that_of_the_reference_is_out_of_reach(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "station.toml"
+    text = GOOD.replace('name = "bench"', f'name = "bench"\n{line}', 1)
+    path.write_text(text.replace("poses = 14", "stop = { uncertainty_g = 1e-5 }", 1))
+    with pytest.raises(DriverError, match=r"plan\.stop\.uncertainty_g: out of reach, since the reference alone is"):
+        load_station(path)
+    path.write_text(text.replace("poses = 14", "stop = { uncertainty_g = 1e-3 }", 1))
+    assert load_station(path).file.plan.stop is not None
