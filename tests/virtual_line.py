@@ -26,7 +26,7 @@ from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
 from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit, RegisterFault, UnitSilent
-from triaxcald.station import collection
+from triaxcald.station import collection, on_demand
 from triaxcald.station.config import Place
 
 START_NS = 1_772_442_000_000_000_000  # 2026-03-02T09:00:00Z, when every unit is switched on
@@ -143,6 +143,13 @@ def _linked(device: VirtualDevice, *arguments: Any, **settings: Any) -> Register
     return RegisterLink(device, *arguments, **settings, clock=device.clock)
 
 
+def _at_once(work: Any) -> asyncio.Future[Any]:
+    """In the virtual time of the unit a judgement takes none, however busy the machine is."""
+    judged: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+    judged.set_result(work())
+    return judged
+
+
 @contextlib.contextmanager
 def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
     """While it is entered, a station's places have these units, by their serials, and it goes by their clocks."""
@@ -164,6 +171,7 @@ def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
         patch.setattr(collection, "LOOK_SAMPLES_S", LOOK_S)
         patch.setattr(collection, "LOOK_HOST_S", 0.0)
         patch.setattr(collection, "LOOK_SHARE", 0.0)
+        patch.setattr(on_demand, "apart", _at_once)
         yield
 
 

@@ -200,12 +200,22 @@ class Loop:
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 
     @cached_property
+    def settled(self) -> bool:
+        """Whether nothing unexplained is open: the effects and outliers that are
+        certain, and probably no more, explain the poses, and the effects are
+        corrected."""
+        return self._known and self.refusal not in (Refusal.UNMODELLED, Refusal.CHANGE_POINT, Refusal.ONE_POSE)
+
+    @cached_property
+    def _known(self) -> bool:
+        return decided(self.posterior) and not self.candidates
+
+    @cached_property
     def call(self) -> Recommendation:
         """The recommended use of the calibration."""
         if self.refusal in (Refusal.UNMODELLED, Refusal.CHANGE_POINT):
             return Recommendation.INVESTIGATE
-        known = decided(self.posterior) and not self.candidates
-        more = self.too_uncertain or self.found.outliers or (not known and self.advice.actions)
+        more = self.too_uncertain or self.found.outliers or (not self._known and self.advice.actions)
         return Recommendation.RECORD_MORE if more else Recommendation.USABLE
 
 

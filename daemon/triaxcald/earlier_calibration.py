@@ -98,6 +98,11 @@ class EarlierFile:
             reference_unit="g",
             output_unit=place.bundle.profile.output.unit,
         )
+        self.require_channels(place)
+
+    def require_channels(self, place: Place) -> None:
+        """Raises Refused if the calibration needs a channel that the unit does not
+        send."""
         sent = getattr(place.bundle.profile.streams[td.READINGS], "channels", None)
         needed = [
             tc.effects.channel_of(n) for n in self.calibration.fitted.channel_reference if not tc.effects.is_derived(n)

@@ -49,6 +49,11 @@ class Pipeline(DecodedStream):
         """The still poses so far, whether their samples are faulty or not."""
         return self._finder.poses(judged=False)
 
+    def sound_poses(self) -> list[tc.Pose]:
+        """The still poses so far; those with faulty samples name the fault, as those
+        of the whole stream do."""
+        return self._finder.poses()
+
     def held(self) -> list[tc.StillSpan]:
         """The same without their noise, which takes longer than all the rest:
         enough to guide an operator by."""

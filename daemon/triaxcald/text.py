@@ -295,6 +295,15 @@ def verification_failed(verification: Mapping[str, Any]) -> str:
     return f"the device's own output in {_poses(verification)} is {_checked(verification)}, {limited}"
 
 
+def golden(verification: Mapping[str, Any], calibration: str | None) -> str:
+    """How a golden unit has verified: by its own output, or by its readings under the
+    file ``calibration``."""
+    of = "the device's own output" if calibration is None else f"the readings under {calibration}"
+    count = tc.number_format.number_of(sum(p["used"] for p in verification["poses"]), "check pose")
+    limit = tc.number_format.micro_g(verification["limit_rms_g"])
+    return f"golden unit: {of} in {count} is {_checked(verification)}, limit {limit}"
+
+
 def _poses(verification: Mapping[str, Any]) -> str:
     count, apart = sum(p["used"] for p in verification["poses"]), verification.get("poses_apart")
     if apart is None or count == 0:

@@ -74,6 +74,13 @@ class Verification:
         variance = max(float(np.sum(4 * e**2 * s**2 - 2 * s**4)), float(np.sum(2 * s**4)))
         return float(np.sqrt(variance)) / (len(e) * rms_g)
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all figures are numbers."""
+        with np.errstate(all="ignore"):
+            figures = [*self.error_g, *self.standard_error_g, self.rms_g or 0.0, self.noise_floor_g or 0.0]
+        return bool(np.isfinite(figures).all())
+
     def _trusted(self, values: tc.Floats) -> tc.Floats:
         return np.delete(values, [i for i, p in enumerate(self.poses) if p.fault])
 
@@ -121,6 +128,32 @@ def verified(pipeline: Pipeline, reference: float) -> Verification:
     poses = pipeline.finish()
     quality = pipeline.data_quality() + of_poses(poses, pipeline.output_unit)
     return replace(verify(poses, reference), data_quality=tuple(quality))
+
+
+def errors_under(poses: Sequence[tc.Pose], model: tc.estimate.Calibration, reference: float) -> Verification:
+    """``poses`` of readings under the calibration ``model`` of another recording. The
+    errors are not finite where its numbers are absurd. Raises InvalidData if a channel
+    that it needs is missing."""
+    if not poses:
+        return verify(poses, reference)
+    with np.errstate(all="ignore"):  # numbers out of a file may be any
+        errors, noise = tc.estimate.magnitude_errors(
+            model.sensor,
+            tc.estimate.with_unexplained_creep(poses, model, elsewhere=True),
+            channel_reference=model.channel_reference,
+            reference=reference,
+            moment=model.moment,
+        )
+    return Verification(poses, errors, noise)
+
+
+def under_calibration(pipeline: Pipeline, model: tc.estimate.Calibration, reference: float) -> Verification:
+    """The whole of a stream of readings under the calibration ``model``, as `verified`.
+    Finishes the ``pipeline``."""
+    compute_with_one_thread()
+    poses = pipeline.finish()
+    quality = pipeline.data_quality() + of_poses(poses, pipeline.output_unit)
+    return replace(errors_under(poses, model, reference), data_quality=tuple(quality))
 
 
 def _rms(values: tc.Floats) -> float | None:

@@ -21,8 +21,11 @@ from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Stage, Verdict
 from triaxcald.schema.event import KINDS, Event, Head
 from triaxcald.schema.outcome import Outcome
+from triaxcald.schema.quality import Quality
+from triaxcald.schema.result import Result
 from triaxcald.schema.results import Results
 from triaxcald.schema.run import Demo, Run
+from triaxcald.schema.station_state import SlotIs, StationState
 from triaxcald.schema.verification import Verification
 
 HERE = Path(__file__).parent
@@ -39,6 +42,9 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "run": Run,
     "demo": Demo,
     "results": Results,
+    "station-state": StationState,
+    "quality": Quality,
+    "result": Result,
 }
 JSON_TYPES = {
     "string": "text",
@@ -151,6 +157,27 @@ RESULTS = """# Results
 Made from the columns in `daemon/triaxcald/schema/columns.py` by `docs/reference/documents.py`; [JSON Schema](results.schema.json).
 
 """  # noqa: E501
+STATION_STATE = """# Station state
+
+The [service](../how-to/run-a-station.md) answers GET `/api/1/station` by `triaxcal.station_state/1`, and begins `/api/1/events` with it.
+
+Made from the model in `daemon/triaxcald/schema/station_state.py` by `docs/reference/documents.py`; [JSON Schema](station-state.schema.json).
+
+"""  # noqa: E501
+QUALITY = """# Quality
+
+The [service](../how-to/run-a-station.md) answers GET `/api/1/quality` by `triaxcal.quality/1`.
+
+Made from the model in `daemon/triaxcald/schema/quality.py` by `docs/reference/documents.py`; [JSON Schema](quality.schema.json).
+
+"""  # noqa: E501
+RESULT = """# Result for receivers
+
+The [service](../how-to/run-a-station.md#results-for-other-systems) sends `triaxcal.result/1` to each receiver of the station file.
+
+Made from the model in `daemon/triaxcald/schema/result.py` by `docs/reference/documents.py`; [JSON Schema](result.schema.json).
+
+"""  # noqa: E501
 JOURNAL = """
 ## Journal
 
@@ -171,6 +198,9 @@ def pages() -> dict[Path, str]:
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),
         "event": _event(),
         "results": RESULTS + _keys(Results),
+        "station-state": STATION_STATE + _keys(StationState) + "\n## State of a slot\n\n" + _words("state", SlotIs),
+        "quality": QUALITY + _keys(Quality),
+        "result": RESULT + _keys(Result),
     }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 

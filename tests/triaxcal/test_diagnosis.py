@@ -79,6 +79,7 @@ def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
         assert loop.after.terms == ("linear",)
         assert loop.refusal is None
         assert loop.call is Recommendation.USABLE
+        assert loop.settled
         assert loop.advice.actions == ()
 
 
@@ -88,6 +89,7 @@ def test_where_something_has_no_name_nothing_is_corrected() -> None:
     loop = diagnose(still_poses(recording.samples()), signs=recording.signs)
     assert loop.refusal is Refusal.UNMODELLED
     assert loop.call is Recommendation.INVESTIGATE
+    assert not loop.settled
     assert loop.found.unexplained.probability > 0.5
     assert loop.after.terms == ("linear",)
     assert all(f.verdict is Verdict.CONFOUNDED for f in loop.findings)

@@ -29,6 +29,7 @@ from triaxcal.planning.design import (
     target_effects,
     unseen_effects,
 )
+from triaxcal.planning.sequential import best_first, magnitude_error
 
 __all__ = [
     "FULL",
@@ -40,6 +41,7 @@ __all__ = [
     "Observability",
     "OptimalPlan",
     "TargetEffects",
+    "best_first",
     "bias_directions",
     "closed",
     "cube_directions",
@@ -49,6 +51,7 @@ __all__ = [
     "in_order",
     "in_plan",
     "linear_design",
+    "magnitude_error",
     "missing_poses",
     "most_wanted",
     "needs_time",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -269,7 +270,9 @@ class _Audit:
 
     def _check_results(self, again: Again) -> None:
         ending = None if self._aborted else again.ending()
-        if again.certified is None and not self._aborted:
+        if again.golden is not None:
+            self._check_golden(again)
+        elif again.certified is None and not self._aborted:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=again.why_not)
         elif again.certified is not None and ending is not None:
             has_one = ending.verdict is not Verdict.FAIL
@@ -287,6 +290,19 @@ class _Audit:
             if VERIFICATION_FILE not in self._held:
                 self._add(VERIFICATION_FILE, Kind.MISSING)
         self._check_registers(again)
+
+    def _check_golden(self, again: Again) -> None:
+        """A golden unit is not calibrated: it has no certificate and no report, its
+        recording no other poses, and none of its registers was written."""
+        for name in (CERTIFICATE, REPORT):
+            self._result(name, None)
+        if self._raw.calibration.records:
+            self._add(RAW_RECORD, Kind.UNCALLED_FOR, "calibration")
+        if again.verification is None and not self._aborted:
+            self._add(VERIFICATION_FILE, Kind.NOT_COMPUTED, again=again.why_not)
+        with suppress(*CANNOT):  # `_check_registers` tells of records that cannot be read
+            if any(access.operation == "write" for access in self._recording.register_accesses()):
+                self._add("/registers", Kind.UNCALLED_FOR, "write")
 
     def _result(self, name: str, again: str | None) -> None:
         """``again`` is None where there ought to be none."""

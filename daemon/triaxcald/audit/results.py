@@ -36,6 +36,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, SEALED_LATER, STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
+from triaxcald.run.golden_unit import GoldenCheck
 from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.schema.outcome import RegistersDone
 from triaxcald.station.config import StationFile, parse_station
@@ -66,8 +67,9 @@ class Digests:
 @dataclass(frozen=True)
 class Again:
     """``certified`` is None where ``why_not`` says why the poses carry no
-    certificate; ``verification`` is None where there are no check poses, or no
-    output to check."""
+    certificate, and for a golden unit, which is verified as ``golden`` says;
+    ``verification`` is None where there are no check poses, or no output to
+    check."""
 
     bundle: td.Bundle
     station: StationFile
@@ -76,6 +78,7 @@ class Again:
     why_not: str
     verification: tc.interchange.Document | None
     previews: Mapping[str, Thinned]
+    golden: GoldenCheck | None = None
 
     @property
     def written(self) -> bool:
@@ -85,11 +88,15 @@ class Again:
 
     @property
     def checked(self) -> bool:
-        """Whether it then asks the device for its own output."""
-        return self.written and td.CORRECTED in self.bundle.profile.streams
+        """Whether it then takes check poses; the line of a golden unit does nothing
+        else."""
+        return self.golden is not None or (self.written and td.CORRECTED in self.bundle.profile.streams)
 
     def ending(self) -> Ending | None:
         """Of a line that came to its end."""
+        if self.golden is not None:
+            found = self.verification
+            return None if found is None or found["after_rms_g"] is None else self.golden.ending(found)
         if self.certified is None:
             return None
         verification = self.verification if self.checked else None
@@ -128,6 +135,12 @@ def compute(recording: Recording, raw: Digests) -> Again:
                 blocks = [drawn[phase][stream].feed(batch)]
             for block in blocks:
                 previews.feed(stream, block)
+    golden = GoldenCheck.of_recording(recording, station, bundle)
+    if golden is not None:
+        verification, why_not = _verified_golden(golden, check, raw.verification)
+        return Again(
+            bundle, station, tumble[td.READINGS], None, why_not, verification, previews.thinned(), golden
+        )  # fmt: skip
     certified, why_not = None, ""
     try:
         certified = _certified(recording, bundle, station, text, tumble[td.READINGS], raw.calibration)
@@ -143,6 +156,18 @@ def compute(recording: Recording, raw: Digests) -> Again:
             apart=_apart(recording, tumble[td.READINGS], station),
         )
     return Again(bundle, station, tumble[td.READINGS], certified, why_not, verification, previews.thinned())
+
+
+def _verified_golden(
+    golden: GoldenCheck, check: Mapping[str, Pipeline], raw: RawDigest
+) -> tuple[tc.interchange.Document | None, str]:
+    """The verification, or None and why there is none."""
+    if not raw.records:
+        return None, "there are no check poses"
+    try:
+        return golden.document(golden.verify(check), raw.hexdigest()), ""
+    except CANNOT as e:
+        return None, str(e) or repr(e)
 
 
 def _apart(recording: Recording, readings: Pipeline, station: StationFile) -> Apart:

@@ -6,6 +6,7 @@ import argparse
 import gzip
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from triaxcald.files import new_beside
 from triaxcald.inputs import CALIBRATION, Measured, read_document
 from triaxcald.tables.arrow import write_parquet
 from triaxcald.tables.native_csv import write_csv
-from triaxcald.verification import Verification, pose_rows, trust, unlike
+from triaxcald.verification import Verification, errors_under, pose_rows, trust, unlike
 
 
 def poses(a: argparse.Namespace) -> int:
@@ -126,17 +127,8 @@ def _require_trusted(measured: Measured) -> None:
 def _verified(measured: Measured, model: tc.estimate.Calibration, *, where: str) -> Verification:
     """Under a calibration of another recording. Raises InputError where what
     ``where`` holds gives no finite errors."""
-    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
-        errors, noise = tc.estimate.magnitude_errors(
-            model.sensor,
-            tc.estimate.with_unexplained_creep(measured.poses, model, elsewhere=True),
-            channel_reference=model.channel_reference,
-            reference=model.reference,
-            moment=model.moment,
-        )
-        found = Verification(measured.poses, errors, noise, tuple(measured.data_quality))
-        figures = np.array([*errors, *noise, found.rms_g, found.noise_floor_g], dtype=float)
-    if not np.isfinite(figures).all():
+    found = replace(errors_under(measured.poses, model, model.reference), data_quality=tuple(measured.data_quality))
+    if not found.is_finite:
         raise InputError(f"{where}: its numbers and the readings of {measured.name} give no finite magnitude")
     return found
 

@@ -51,6 +51,10 @@ def serve_command(a: argparse.Namespace) -> int:
     check_lines(station.places, where=str(station.path))
     if a.backup is not None:
         return _backup(a, station)
+    if station.file.rules.golden is not None:
+        from triaxcald.run.golden_unit import golden_calibration
+
+        golden_calibration(station)
     from triaxcald.service.gate import require_safe
     from triaxcald.service.server import Address, serve
 

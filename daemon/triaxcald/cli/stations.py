@@ -44,6 +44,10 @@ def run_command(a: argparse.Namespace) -> int:
     station = with_serials(station, a.serial)
     given = {key: getattr(a, key) for key in ("operator", "order", "batch", "part_number", "fixture", "reason")}
     work = works(station, given)
+    if station.file.rules.golden is not None:
+        from triaxcald.run.golden_unit import golden_calibration
+
+        golden_calibration(station)  # a unit that has no serial number yet may be the golden one
     rezero = {}
     if a.rezero:
         from triaxcald.earlier_calibration import earlier_by_unit
@@ -111,7 +115,7 @@ def _unit(o: Outcome) -> UnitOfRun:
         error=o.error,
         wanted_poses=list(o.wanted),
         data_quality=list(o.data_quality),
-        serial=o.certified.document["unit"]["serial"] if o.certified else None,
+        serial=o.document["serial"] if o.certified or o.verification else None,
         recording=_text(o.recording),
         certificate=_text(o.certificate),
         report=_text(o.report),
@@ -148,6 +152,8 @@ def show_summary(o: Outcome) -> None:
         checked = f"; own output {micro(own['before_rms_g'])} before, {micro(own['after_rms_g'])} after" if own else ""
         show(f"         µg rms: {fit}{checked}")
         show(f"         terms: {', '.join(o.certified.calibration.terms)}")
+    elif o.verification is not None:  # a golden unit: the line above has the figure
+        show("         verified alone, nothing is written")
     if o.device_state is not None:
         show(f"         {o.device_state}")
     if (path := o.report or o.outcome) is not None:

@@ -355,9 +355,9 @@ def _line(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("devices", metavar="DEVICE.toml", type=Path, nargs="+")
     p.add_argument(
-        "--follow", metavar="FILE|-",
+        "--follow", metavar="FILE|-|URL",
         help="turn the units and switch their supplies as the events of `run --events` say, from a file that grows, a "
-        "FIFO, or standard input",
+        "FIFO, standard input, or a station's service (http://…)",
     )  # fmt: skip
     p = _command(
         commands, "record", "record:record_command", "record only",

@@ -63,13 +63,17 @@ def works(station: Station, given: Mapping[str, str | None]) -> dict[str, Work]:
 
 
 def require_serial(rules: Rules, serial: str, slot: str) -> None:
-    """Raises RuleBroken if the serial number does not match the rule."""
-    if rules.serial is not None and not re.fullmatch(rules.serial, serial):
+    """Raises RuleBroken if the serial number does not match the rule, and is not that
+    of the golden unit."""
+    if rules.serial is not None and not rules.of_golden(serial) and not re.fullmatch(rules.serial, serial):
         raise RuleBroken("serial", f"unit {slot}: serial number {serial}: rules.serial expects {rules.serial}")
 
 
 def require_allowed(rules: Rules, work: Work, serial: str, history: History) -> None:
-    """Raises RuleBroken if the rules forbid another attempt at the serial number."""
+    """Raises RuleBroken if the rules forbid another attempt at the serial number. The
+    golden unit may always be verified."""
+    if rules.of_golden(serial):
+        return
     if rules.attempts is not None and history.attempts >= rules.attempts:
         raise RuleBroken(
             "attempts",

@@ -7,7 +7,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Generator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ from triaxcald.outcome import (
 )
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.journal import Owner, journals_of, open_journal
-from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.procedure import Provisioning, to_its_end
 from triaxcald.provision.registers import RegisterImage, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.raw_to_poses import Pipeline
@@ -49,15 +49,19 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
 from triaxcald.run.endings import aborted, judged
+from triaxcald.run.golden_unit import ATTACHMENT as GOLDEN_FILE
+from triaxcald.run.golden_unit import RECORD as GOLDEN_RECORD
+from triaxcald.run.golden_unit import GoldenCheck, check_directions, require_trusted
 from triaxcald.run.orders import require_allowed, require_serial
 from triaxcald.run.session import UnitSession
-from triaxcald.run.together import side_by_side
+from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.run.tray_progress import TrayProgress
-from triaxcald.run.write_back import WriteBack, corrected
+from triaxcald.run.write_back import VERIFICATION_FILE, WriteBack, corrected
 from triaxcald.schema.codes import Stage
 from triaxcald.software import new_run_id, software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
+from triaxcald.station.on_demand import Judge, Judgement, OnDemand
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import ActiveUnits, RetryPolicy, Streaming
 from triaxcald.station.tray import Tray
@@ -99,7 +103,7 @@ class Outcome:
 
 
 class UnitRun(UnitSession):
-    """The whole line for one unit of a station.
+    """The whole line for one unit of a station. The golden unit is verified alone.
 
     ``force`` is the reason to write in spite of sanity warnings, ``others`` counts
     the active units of the station. ``rezero`` is a calibration whose biases alone
@@ -145,6 +149,8 @@ class UnitRun(UnitSession):
         self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
+        self._golden: GoldenCheck | None = None
+        self._golden_verification: tc.interchange.Document | None = None
         self._document: tc.interchange.Document | None = None
         self._lost = 0
 
@@ -169,6 +175,7 @@ class UnitRun(UnitSession):
                 identity = await self.identify(device)
                 await self._identified(identity)
                 path = unused(self.recording_path(identity))
+                self._golden = await self._golden_check(identity)
                 if self.rezero is not None:
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
@@ -178,8 +185,10 @@ class UnitRun(UnitSession):
                     self._recording = path
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
+                    if self._golden is not None and self._golden.file is not None:
+                        writer.attach(GOLDEN_FILE, "application/json", self._golden.file.data)
                     ending = await self._ending(device, identity, writer)
-                    self._finalize(writer, ending)
+                    await _at_the_disk(partial(self._finalize, writer, ending))
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             if self._document is None:  # a stored outcome is final
                 ending = self._aborted(e)
@@ -189,14 +198,14 @@ class UnitRun(UnitSession):
         assert ending is not None
         written = True
         try:
-            self._write_artifacts()
+            await _at_the_disk(self._write_artifacts)
         except InputError as e:
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
             code = ending.code if ending.exit_code else Code.DISK
             ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
             written = False
         if self._attempt_file is not None:
-            self._leave(self._attempt_file, written)
+            await _at_the_disk(partial(self._leave, self._attempt_file, written))
         return self._outcome(ending)
 
     def _leave(self, file: AttemptFile, written: bool) -> None:
@@ -273,21 +282,24 @@ class UnitRun(UnitSession):
 
     @property
     def _records(self) -> dict[str, dict[str, str]]:
-        """Metadata of the recording: the run, its work, and the earlier calibration of
-        a rezero."""
+        """Metadata of the recording: the run, its work, the earlier calibration of a
+        rezero, and how a golden unit is verified."""
         attempt = self._attempt
         return {
             RUN_RECORD: {"run": attempt.run, "started": attempt.started},
             WORK_RECORD: attempt.work.record(),
             **self._rezero_record,
+            **({} if self._golden is None else {GOLDEN_RECORD: self._golden.record}),
         }
 
     async def _ending(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         try:
+            if self._golden is not None:
+                return await self._verify_golden(device, identity, writer, self._golden)
             return await self._line(device, identity, writer)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording still gets its outcome
             if self._confirmation is not None and self._confirmation.unconfirmed:
-                self._certified = None  # its records may be another unit's
+                self._certified, self._golden_verification = None, None  # its records may be another unit's
             ending = self._aborted(e)
             with suppress(RecordingError):
                 writer.event("failed", {"error": ending.reason})
@@ -338,7 +350,7 @@ class UnitRun(UnitSession):
             if contents is None
             else Papers(
                 measured=measured_in(certificate) if certificate else None,
-                verification=back.verification if back else None,
+                verification=self._verification,
                 registers=registers_told(back.provisioning) if back and back.provisioning else None,
                 limits=limits,
                 outside=certificate["outside"] if certificate else (),
@@ -355,6 +367,10 @@ class UnitRun(UnitSession):
             forced=self.force if back and back.warnings else None,
             attempt=replace(self._attempt, recording=self._recording.name if self._recording else None),
         )
+
+    @property
+    def _verification(self) -> tc.interchange.Document | None:
+        return self._write_back.verification if self._write_back else self._golden_verification
 
     @property
     def _journal(self) -> str | None:
@@ -402,7 +418,7 @@ class UnitRun(UnitSession):
             report=self._paths.get(REPORT),
             outcome=self._paths.get(ATTACHMENT),
             certified=self._certified,
-            verification=back.verification if back else None,
+            verification=self._verification,
             provisioned=back.provisioning if back else None,
             device_state=state,
             recovery_command=self._recovery_command,
@@ -425,7 +441,7 @@ class UnitRun(UnitSession):
     async def _require_readings_before(self, device: td.Device) -> None:
         """Check, before any pose is taken, that the registers state their readings.
         Raises Refused, DriverError."""
-        written = self.station.file.provisioning.write and why_not_written(self.profile) is None
+        written = self.station.file.provisioning.write and why_not_written(self.profile) is None and not self._golden
         if written and leaves_open(self.profile):
             with suppress(td.RegisterRefused):  # an unreadable register is not written either
                 require_readings_before(self.profile, await self.registers(device))
@@ -433,6 +449,37 @@ class UnitRun(UnitSession):
     @property
     def _rezero_record(self) -> dict[str, dict[str, str]]:
         return {} if self.rezero is None else {RECORD: {"calibration": self.rezero.name}}
+
+    async def _golden_check(self, identity: IdentityRead) -> GoldenCheck | None:
+        """How the unit is verified, None if it is not the golden one. Raises
+        InputError, Refused."""
+        serial = identity.serial or self._attempt.work.serial
+        golden = await asyncio.to_thread(GoldenCheck.at_place, self.station, self.place, serial)
+        if golden is not None and self.rezero is not None:
+            raise InputError(
+                f"unit {self.name}: serial number {serial} is the golden unit, which is verified and keeps its biases; "
+                "give no --rezero for it"
+            )
+        return golden
+
+    async def _verify_golden(
+        self, device: td.Device, identity: IdentityRead, writer: RecordingWriter, golden: GoldenCheck
+    ) -> Ending:
+        """Verify the golden unit in check poses. Nothing is written to it."""
+        plan = self.station.file.plan
+        check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
+        self._acquisition = check
+        self._confirmation = self.confirmation(device, identity, writer, check)
+        policy = RetryPolicy(plan.comes_back_s, others=self.others)
+        reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
+        async with self._confirmation.phase():
+            self.progress.stage(self.name, Stage.CHECK_POSES)
+            await self._collect(reconnecting, writer, check, golden.stream, plan.check_poses)
+        found = await asyncio.to_thread(golden.verify, check.pipelines)
+        document = self._golden_verification = golden.document(found, check.digest.hexdigest())
+        writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
+        require_trusted(found.poses)
+        return golden.ending(document)
 
     async def _line(self, device: td.Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
@@ -443,10 +490,10 @@ class UnitRun(UnitSession):
         reconnecting = self.reconnecting(device, identity, policy, confirmation=self._confirmation)
         async with self._confirmation.phase():
             self.progress.stage(self.name, Stage.POSES)
-            wanted = plan.poses if self.rezero is None else plan.rezero_poses
+            wanted = plan.poses_most if self.rezero is None else plan.rezero_poses
             await self._collect(reconnecting, writer, acquisition, td.READINGS, wanted)
         self.progress.stage(self.name, Stage.FITTING)
-        poses = acquisition.pipelines[td.READINGS].finish()
+        poses = await asyncio.to_thread(acquisition.pipelines[td.READINGS].finish)
         certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
             await self._write(device, writer, certified.image, identity, acquisition)
@@ -531,9 +578,15 @@ class UnitRun(UnitSession):
         wanted: int,
         apart_from: tc.Floats | None = None,
     ) -> None:
-        plan, targets = self.station.file.plan, None
-        if self.rezero is not None and stream == td.READINGS:
+        plan, targets, on_demand = self.station.file.plan, None, None
+        if self.rezero is None and stream == td.READINGS and plan.stop is not None:
+            judge = Judge.of(plan.stop, self.place, self.station.file)
+            on_demand = OnDemand(judge, repeat=plan.repeat, tell=partial(self._judged, writer))
+            targets = on_demand.targets
+        elif self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
+        if self._golden is not None:
+            plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
         if self.tray is not None:
             targets = (
                 self.tray.targets(self.name, targets or tc.planning.directions(wanted))
@@ -550,7 +603,14 @@ class UnitRun(UnitSession):
             nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == td.READINGS else (1, 1, 1),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
+            on_demand=on_demand,
         )
+
+    @staticmethod
+    def _judged(writer: RecordingWriter | None, found: int, judgement: Judgement) -> None:
+        """Note in the recording why the poses on demand went on, or ended."""
+        if writer is not None:
+            writer.event("poses_judged", {"found": found, **asdict(judgement)})
 
     async def check(self) -> Verification:
         """Verify the device's own corrected output in check poses; records and writes
@@ -569,6 +629,12 @@ class UnitRun(UnitSession):
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:
         back = self._write_back
         return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
+
+
+async def _at_the_disk(work: Callable[[], None]) -> None:
+    """Do ``work`` on a thread, to its end: a slow disk holds up no other unit, and
+    nothing leaves half of a document."""
+    await to_its_end(whole_on_a_thread(work))
 
 
 @dataclass

@@ -102,7 +102,7 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
-        self.warnings = [*p.warnings, *self._output_warnings(acquisition)]
+        self.warnings = [*p.warnings, *await asyncio.to_thread(self._output_warnings, acquisition)]
         if self.warnings and self.force is None:
             raise Implausible(text.refused_by_sanity_warnings(self.warnings))
         self._attach(REGISTERS_BEFORE, p.found.raw)
@@ -159,21 +159,27 @@ class WriteBack:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
-        found, reference = corrected(check, self.station.file.reference), self.station.file.reference
-        fitted = fitted_attitudes(acquisition.pipelines[td.READINGS], self.place.signs)
-        document = self.verification = verification_document(
-            corrected(acquisition, reference),
-            found,
-            limit_g=self.station.file.limits.verification_rms_g,
-            raw_sha256=check.digest.hexdigest(),
-            apart=Apart(fitted, self.station.file.plan.apart_deg),
-        )
+        found, document = await asyncio.to_thread(self._judged, acquisition, check)
+        self.verification = document
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
         if found.rms_g is None:
             faults = ", ".join(dict.fromkeys(p.fault for p in found.untrusted))
             why = f"no check pose can be trusted: {len(found.poses)} left out ({faults})"
             raise tc.Refused(why if found.poses else "there is no check pose")
         return str(document["verdict"])
+
+    def _judged(self, acquisition: Collection, check: Collection) -> tuple[Verification, tc.interchange.Document]:
+        reference = self.station.file.reference
+        found = corrected(check, reference)
+        fitted = fitted_attitudes(acquisition.pipelines[td.READINGS], self.place.signs)
+        document = verification_document(
+            corrected(acquisition, reference),
+            found,
+            limit_g=self.station.file.limits.verification_rms_g,
+            raw_sha256=check.digest.hexdigest(),
+            apart=Apart(fitted, self.station.file.plan.apart_deg),
+        )
+        return found, document
 
     def _attach(self, name: str, raw: Mapping[str, bytes]) -> None:
         held = {register: value.hex() for register, value in raw.items()}

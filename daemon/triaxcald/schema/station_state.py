@@ -83,4 +83,11 @@ class StationState(tc.schema.Model):
     work: Annotated[WorkOfTray, Field(description="what the units are measured for")]
     instruction: Annotated[InstructionOfTray | None, Field(description="what to do with the tray; `null` if nothing")]
     blocked: Annotated[str | None, Field(description="code of what keeps the next start from happening; else `null`")]
+    blocked_slots: Annotated[
+        list[str],
+        Field(
+            default_factory=list,
+            description="slots of the next start whose golden unit is due or has failed, if `blocked` says so",
+        ),
+    ]
     slots: Annotated[list[SlotState], Field(description="the slots, in the order of the station file")]

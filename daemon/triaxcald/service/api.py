@@ -38,7 +38,7 @@ class Who(Protocol):
 class Access(Protocol):
     """Who may do what, and the trail of what was done."""
 
-    async def require(self, request: Request, role: str) -> Any:
+    async def require(self, request: Request, role: str, *, touch: bool = True) -> Any:
         """Raises ApiError."""
 
     async def trail(
@@ -129,11 +129,15 @@ def station_router(service: Service) -> APIRouter:
         live: Annotated[bool, Query(description="also `live`: the present directions, for a picture")] = False,
         last_event_id: Annotated[str | None, Header(description="of a browser that comes again")] = None,
     ) -> EventSourceResponse:
-        await access.require(request, "reader")
+        await access.require(request, "reader", touch=False)
         if after is None and last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             after = min(int(last_event_id[:19]), SEQ_MOST)
         # Its own sign of life is a comment, which a page cannot see: ours is an event.
-        messages = sent(floor.stream.listen(after), live=live)
+
+        async def may_listen() -> None:
+            await access.require(request, "reader", touch=False)
+
+        messages = sent(floor.stream.listen(after), may_listen, live=live)
         return EventSourceResponse(messages, ping=3600, headers={"Cache-Control": "no-store"})
 
     @router.post("/scan")
@@ -167,9 +171,12 @@ def station_router(service: Service) -> APIRouter:
     return router
 
 
-async def sent(messages: AsyncGenerator[Message], *, live: bool = False) -> AsyncIterator[ServerSentEvent]:
+async def sent(
+    messages: AsyncGenerator[Message], may_listen: Callable[[], Awaitable[None]], *, live: bool = False
+) -> AsyncIterator[ServerSentEvent]:
     """The messages as server-sent events, and a sign of life every `ALIVE_S`; those of
-    the kind `live` if wanted."""
+    the kind `live` if wanted. Ends once ``may_listen`` raises ApiError: the session or
+    the token has ended."""
     loop = asyncio.get_running_loop()
     beat_s = loop.time() + ALIVE_S
     following: asyncio.Task[Message] = asyncio.ensure_future(anext(messages))
@@ -186,6 +193,10 @@ async def sent(messages: AsyncGenerator[Message], *, live: bool = False) -> Asyn
                 following = asyncio.ensure_future(anext(messages))
             if loop.time() >= beat_s:
                 beat_s = loop.time() + ALIVE_S
+                try:
+                    await may_listen()
+                except ApiError:
+                    return
                 yield ServerSentEvent("{}", event="alive")
     finally:
         following.cancel()

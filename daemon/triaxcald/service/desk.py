@@ -98,6 +98,7 @@ class Desk:
         self.tray: str | None = None
         self.instruction: dict[str, Any] | None = None
         self.blocked: str | None = None
+        self.blocked_slots: list[str] = []
         self.chosen: str | None = None
         self.starts: dict[str, dict[str, Any]] = {}
         """Answers to requests to start, by their id."""
@@ -117,6 +118,7 @@ class Desk:
             "work": dict(self.work),
             "instruction": self.instruction or self._of_the_only_unit(),
             "blocked": self.blocked,
+            "blocked_slots": list(self.blocked_slots),
             "slots": [slot.document() for slot in self.slots.values()],
         }
 
@@ -202,11 +204,19 @@ class Desk:
     def due(self) -> dict[str, str | None]:
         """Expected serial numbers of the slots that a start would run: those that were
         scanned, or without any those that the station file names."""
-        scanned = {s.slot: s.serial for s in self.slots.values() if s.state is SlotIs.SCANNED}
-        named: dict[str, str | None] = {s.slot: s.expected for s in self.slots.values() if s.expected is not None}
-        if not (due := scanned or named):
+        if not (due := self._next_start()):
             raise ApiError(Problem.INVALID, "no unit is scanned; scan the serial number of the unit in each slot")
         return due
+
+    @property
+    def waiting(self) -> dict[str, str | None]:
+        """As `due`; nothing while a tray runs."""
+        return {} if self.running else self._next_start()
+
+    def _next_start(self) -> dict[str, str | None]:
+        scanned = {s.slot: s.serial for s in self.slots.values() if s.state is SlotIs.SCANNED}
+        named: dict[str, str | None] = {s.slot: s.expected for s in self.slots.values() if s.expected is not None}
+        return scanned or named
 
     # From the runs.
 

@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from triaxcald.errors import DaemonError, InputError
 from triaxcald.run.attempts import Killed, settle_killed
 from triaxcald.run.events import Events
+from triaxcald.run.golden_unit import golden_calibration
 from triaxcald.run.orders import RuleBroken, require_serial, with_serials, works
 from triaxcald.run.unit_run import Outcome, TrayRun
 from triaxcald.schema.codes import Code, Stage
+from triaxcald.service import golden
 from triaxcald.service.desk import Desk, Scanned
 from triaxcald.service.errors import ApiError, Problem
 from triaxcald.service.stream import Stream
@@ -35,6 +37,9 @@ DISK_LEAST: Final = 64 << 20
 """Free bytes below which no tray starts: more than the recordings of a tray of four."""
 LIVE_S: Final = 0.4
 """Shortest time between two pictures of the directions."""
+DAY_S: Final = 86_400.0
+DUE_LATE_S: Final = 0.1
+"""A golden unit is shown as due so long after the moment, so that it surely is."""
 DESK: Final = "desk"
 """Key of what is kept of the desk."""
 
@@ -48,15 +53,22 @@ class Book(Protocol):
 
     def put_setting(self, key: str, value: Any) -> None: ...
 
+    def golden(self, serial: str, slots: Sequence[str]) -> dict[str, golden.LastCheck]: ...
+
+
+def _now_us() -> int:
+    return time.time_ns() // 1000
+
 
 def now() -> str:
     return iso_time(time.time_ns())
 
 
 class Floor:
-    """``load`` reads the station file again. ``log`` takes a line for people,
-    ``recorded`` is called after runs have entered the database. All methods are called
-    in the event loop; those that take something from people raise ApiError."""
+    """``load`` reads the station file again, ``loaded`` receives the new station.
+    ``log`` takes a line for people, ``recorded`` is called after runs have entered the
+    database. All methods are called in the event loop; those that take something from
+    people raise ApiError."""
 
     def __init__(
         self,
@@ -67,8 +79,10 @@ class Floor:
         load: Callable[[], Station],
         log: Callable[[str], None],
         recorded: Callable[[], None] = lambda: None,
+        loaded: Callable[[Station], None] = lambda _: None,
     ) -> None:
         self.station, self._book, self._load, self._log, self._recorded = station, book, load, log, recorded
+        self._loaded = loaded
         self.desk = _desk_of(station)
         self.stream = stream(self.state)
         self._tray: TrayRun | None = None
@@ -78,6 +92,8 @@ class Floor:
         self._again = False
         self._stopping = False
         self._saved: dict[str, Any] | None = None
+        self._checks: dict[str, golden.LastCheck] = {}
+        self._due_timer: asyncio.TimerHandle | None = None
         self.counts: dict[str, int] = {}
         """Runs by verdict since the service began."""
 
@@ -97,12 +113,26 @@ class Floor:
 
     def state(self, seq: int) -> dict[str, Any]:
         """The `triaxcal.station_state/1` after the event ``seq``."""
-        self.desk.blocked = self.blocked
+        slots = self._golden_blocked()
+        self.desk.blocked = self._blocked(slots)
+        self.desk.blocked_slots = list(slots) if self.desk.blocked in list(slots.values()) else []
         return self.desk.document(seq)
 
     @property
     def blocked(self) -> str | None:
         """Code of what keeps the next tray from starting."""
+        return self._blocked(self._golden_blocked())
+
+    def _blocked(self, slots: Mapping[str, Problem]) -> str | None:
+        return self._trouble or golden.worst(slots)
+
+    def _golden_blocked(self) -> dict[str, Problem]:
+        """Slots of the next start that wait for their golden unit."""
+        return golden.blocked_slots(self.station.file.rules, self.desk.waiting, self._checks, _now_us())
+
+    @property
+    def _trouble(self) -> str | None:
+        """Code of a fault of this computer that keeps any tray from starting."""
         if self.stream.trouble is not None:
             return Problem.DATABASE.value
         with suppress(OSError):
@@ -158,8 +188,9 @@ class Floor:
             if self._stopping:
                 raise ApiError(Problem.RUNNING, "the service is about to end")
             due = self.desk.due()
-            if (blocked := self.blocked) is not None:
-                raise ApiError(Problem(blocked), _BLOCKED[Problem(blocked)])
+            if (trouble := self._trouble) is not None:
+                raise ApiError(Problem(trouble), _BLOCKED[Problem(trouble)])
+            await self._require_golden(due)
             tray = await self._made(due)
             runs = {slot: unit.run for slot, unit in tray.units.items()}
             answer = {"tray": tray.id, "runs": runs}
@@ -172,6 +203,20 @@ class Floor:
             self._tray = tray
             self._task = asyncio.ensure_future(self._run(tray))
             return answer
+
+    async def _require_golden(self, due: Mapping[str, str | None]) -> None:
+        """Refuse slots whose golden unit is due or has failed, by the outcomes in the
+        folder."""
+        rules = self.station.file.rules
+        if rules.golden is None:
+            return
+        try:
+            await self._take()
+        except DaemonError as e:
+            raise ApiError(Problem.DATABASE, str(e)) from e
+        blocked = golden.blocked_slots(rules, due, self._checks, _now_us())
+        if (problem := golden.worst(blocked)) is not None:
+            raise ApiError(problem, golden.told(rules, blocked))
 
     async def stop(self, reason: str) -> dict[str, Any]:
         """Stop all units at work; gives their slots."""
@@ -201,14 +246,16 @@ class Floor:
         """Stop what is at work, and wait until each device is in order. Each
         cancellation meanwhile is passed on to the units."""
         self._stopping = True
-        if self._task is not None:
+        if self._due_timer is not None:
+            self._due_timer.cancel()
+        if (task := self._task) is not None:
             for slot in self.desk.slots:
                 self._stop(slot, "the service was stopped")
-            while not self._task.done():
+            while not task.done():
                 try:
-                    await asyncio.wait([self._task])
+                    await asyncio.wait([task])
                 except asyncio.CancelledError:
-                    self._task.cancel()
+                    task.cancel()
         await self._save()
 
     # A tray.
@@ -279,13 +326,39 @@ class Floor:
 
     async def _enter(self) -> None:
         """Bring the database up to date with the folder."""
+        try:
+            await self._take()
+        except DaemonError as e:
+            self._log(f"triaxcal: {e}")
+
+    async def _take(self) -> None:
+        """Bring the database up to date with the folder. Raises DaemonError."""
         async with self._entering:
-            try:
-                await asyncio.to_thread(self._book.take)
-            except DaemonError as e:
-                self._log(f"triaxcal: {e}")
-                return
+            await asyncio.to_thread(self._book.take)
+            rule, before = self.station.file.rules.golden, self._checks
+            slots = list(self.desk.slots)
+            self._checks = {} if rule is None else await asyncio.to_thread(self._book.golden, rule.serial, slots)
         self._recorded()
+        self._await_due()
+        if self._checks != before:
+            self.stream.changed()
+
+    def _await_due(self) -> None:
+        """Show it when the golden unit of a slot becomes due."""
+        if self._due_timer is not None:
+            self._due_timer.cancel()
+        now_us = _now_us()
+        due_us = golden.next_due_us(self.station.file.rules, self._checks, now_us)
+        if due_us is None or self._stopping:
+            self._due_timer = None
+            return
+        # A day at most: the host's clock may be set.
+        wait_s = min((due_us - now_us) / 1e6 + DUE_LATE_S, DAY_S)
+        self._due_timer = asyncio.get_running_loop().call_later(wait_s, self._due)
+
+    def _due(self) -> None:
+        self._await_due()
+        self.stream.changed()
 
     async def _changed(self) -> None:
         self.stream.changed()
@@ -307,13 +380,16 @@ class Floor:
         try:
             station = await asyncio.to_thread(self._load)
             station.require_units()
+            await asyncio.to_thread(golden_calibration, station)
         except (DaemonError, Exception) as e:  # noqa: BLE001 - the old station file stays in use
             self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
             return
         kept = self.desk.kept()
         self.station, self.desk = station, _desk_of(station)
         self.desk.restore(kept, now())
+        self._loaded(station)
         self._log(f"{station.path}: loaded again")
+        await self._enter()  # its golden unit may be another
         await self._changed()
 
 

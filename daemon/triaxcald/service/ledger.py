@@ -34,6 +34,7 @@ from triaxcald.service.database import (
     plain_engine,
     postgresql_engine,
 )
+from triaxcald.service.golden import LastCheck
 from triaxcald.station.config import Station
 from triaxcald.store import BESIDE, FILE_NAME, VERSION, Store
 from triaxcald.utc import iso_time
@@ -425,6 +426,25 @@ class Ledger:
     def unit(self, serial: str) -> list[dict[str, Any]]:
         """All runs of a unit, in the order of time."""
         return self.every(RunFilter(serial=serial))
+
+    def golden(self, serial: str, slots: Sequence[str]) -> dict[str, LastCheck]:
+        """The last verification of the golden unit ``serial`` in each of these slots,
+        as far as there is one. Runs without a verdict and calibrations are none."""
+        run, filed = self.run, tables.filed
+        of_unit = select(filed.c.outcome).where(filed.c.home == self.home, filed.c.plain_serial == plain_serial(serial))
+        query = self._here(select(run.c.ended_us, run.c.verdict)).where(
+            run.c.outcome.in_(of_unit),
+            run.c.verdict.in_([Verdict.PASS.value, Verdict.FAIL.value]),
+            run.c.verification_rms_g.is_not(None),
+            run.c.rms_g.is_(None),
+        )
+        query = query.order_by(run.c.ended_us.desc(), run.c.outcome.desc()).limit(1)
+        found = {}
+        with self.reading() as db:
+            for slot in slots:
+                if (row := db.execute(query.where(run.c.slot == slot)).first()) is not None:
+                    found[slot] = LastCheck(int(row.ended_us), row.verdict == Verdict.PASS)
+        return found
 
     def measurements_of(self, run_id: str) -> list[dict[str, Any]]:
         """The figures of a run."""

@@ -21,6 +21,7 @@ from scipy.optimize import brentq
 
 import triaxcal as tc
 from triaxcald.schema.codes import Verdict
+from triaxcald.service.golden import is_check
 from triaxcald.work import plain_serial
 
 FIGURES: Final = {
@@ -68,7 +69,8 @@ class _Attempts:
         number: dict[str, int] = {}
         units = []
         for row in rows:
-            if not row["tried"] or row["run"] in seen:  # the folder may hold a copy of an outcome
+            # The folder may hold copies of outcomes; a golden unit checks the station.
+            if not row["tried"] or row["run"] in seen or is_check(row):
                 continue
             if row["run"] is not None:
                 seen.add(row["run"])

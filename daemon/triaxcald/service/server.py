@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import uvicorn
 from fastapi import FastAPI
@@ -28,6 +30,7 @@ from triaxcald.service.page import page_router
 from triaxcald.service.stream import Stream
 from triaxcald.service.supervisor import Supervisor
 from triaxcald.station.config import Station, load_station
+from triaxcald.station.lock import fcntl
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ async def serve(
     """Serve until cancelled; then end the runs in order. ``ready`` receives the URL and
     the service once it answers, ``reload`` asks for the station file to be read again.
     Raises DaemonError."""
-    with bound(address) as listening:
+    with alone(station.folder), bound(address) as listening:
         ledger = await asyncio.to_thread(Ledger.open, station, database)
         hosts = known_hosts(address.host, listening.getsockname()[1], secure=address.secure)
         try:
@@ -101,9 +104,16 @@ async def _working(
     """A service whose events are stored and whose results are delivered."""
     outbox = Outbox(ledger, station, log)
     access = Access(ledger, station, secure=address.secure, hosts=hosts, log=log)
+
+    def loaded(again: Station) -> None:
+        access.station = again
+        ledger.receive(again)
+        outbox.receive(again)
+        outbox.news()
+
     floor = Floor(
         station, ledger, partial(Stream, ledger), load=partial(load_station, station.path), log=log,
-        recorded=outbox.news,
+        recorded=outbox.news, loaded=loaded,
     )  # fmt: skip
     service = StationService(floor, ledger, access, outbox)
     await asyncio.to_thread(ledger.begin_deliveries)
@@ -182,6 +192,30 @@ class _Server(StationServer):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+
+LOCK: Final = "service.lock"
+"""The kernel releases it at every end of the process; the file stays."""
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keep other services out of the folder, whose events they would number too. Raises
+    StationError if one works there, InputError if the folder cannot be used."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as e:
+        raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as e:
+                raise StationError(f"{folder}: another `triaxcal serve` works there; stop it first") from e
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import triaxcal as tc
 import triaxcal_drivers as td
@@ -23,6 +23,9 @@ from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.listening import RawRecords
 from triaxcald.station.reconnect import Streaming
 from triaxcald.station.tray import Instruction
+
+if TYPE_CHECKING:  # a mere recording needs no metrology
+    from triaxcald.station.on_demand import OnDemand
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """Shortest time between two evaluations of the poses, by the samples' time and by the
@@ -243,15 +246,18 @@ class Collection(Recorded):
         tell: Callable[[Guide], None],
         apart_from: tc.Floats | None = None,
         targets: Sequence[tc.planning.Direction] | None = None,
+        on_demand: OnDemand | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Record until ``stream`` shows ``wanted`` distinct poses, and of the readings
         the first pose once more if the plan wants it.
 
-        ``tell`` receives the guidance. ``apart_from`` and ``targets`` as in `guide`. A
-        device that sends no complete sample of ``stream`` is reconnected. Raises
-        NoPoses if no new pose comes for ``plan.patience_s``, and the errors of the
-        device's stream. A missing repeat alone is no error.
+        ``tell`` receives the guidance. ``apart_from`` and ``targets`` as in `guide`.
+        With ``on_demand`` as many poses are wanted as it says; while it decides,
+        nothing new is told, so that the present pose is held. A device that sends no
+        complete sample of ``stream`` is reconnected. Raises NoPoses if no new pose
+        comes for ``plan.patience_s``, and the errors of the device's stream. A missing
+        repeat alone is no error.
         """
         pipeline = self.pipelines[stream]
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
@@ -268,10 +274,12 @@ class Collection(Recorded):
                 now_s, host_s = pipeline.seconds, clock_s()
                 if now_s - looked_s < LOOK_SAMPLES_S or host_s < next_host_s:
                     continue
+                if on_demand is not None and on_demand.deciding():
+                    continue
                 looked_s = now_s
                 state = guide(
                     pipeline.held(),
-                    wanted=wanted,
+                    wanted=wanted if on_demand is None else on_demand.wanted,
                     hold_s=plan.hold_s,
                     apart_deg=plan.apart_deg,
                     now_s=now_s,
@@ -281,8 +289,14 @@ class Collection(Recorded):
                     counted_s=counted_s,
                     apart_from=apart_from,
                     targets=targets,
+                    best_first=on_demand is not None,
                 )
                 counted_s = state.counted_s
+                poses = len(counted_s)
+                if on_demand is not None and on_demand.is_due(state.found, poses, complete=state.complete):
+                    on_demand.begin(state.found, poses, pipeline.sound_poses())
+                    if on_demand.deciding():
+                        continue
                 took_s = clock_s() - host_s
                 next_host_s = host_s + took_s + max(LOOK_HOST_S, LOOK_SHARE * took_s)
                 tell(state)
@@ -295,7 +309,7 @@ class Collection(Recorded):
                     if state.repeat_due:
                         return
                     raise NoPoses(
-                        f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
+                        f"no new still pose for {plan.patience_s:g} s; {found} of {state.wanted} are there",
                         wanted=state.missing,
                     )
 

@@ -31,11 +31,35 @@ PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
 
 
+class Stop(td.Strict):
+    """Poses on demand: the acquisition ends as soon as they suffice."""
+
+    uncertainty_g: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="combined standard uncertainty of the magnitude, rms over all orientations, as the budget of "
+            "the certificate states it",
+        ),
+    ]
+    poses_least: Annotated[int, Field(ge=9, le=1000, description="distinct poses in any case")] = 9
+    poses_most: Annotated[
+        int, Field(ge=9, le=1000, description="distinct poses of the plan, after which it ends in any case")
+    ] = 26
+
+    @model_validator(mode="after")
+    def _least_is_not_above_most(self) -> Self:
+        if self.poses_least > self.poses_most:
+            raise ValueError(f"poses_least: {self.poses_least} is above poses_most, {self.poses_most}")
+        return self
+
+
 class Plan(td.Strict):
     """Poses to record, seconds to hold each, poses to check the device by
     afterwards."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
+    stop: Annotated[Stop | None, Field(description="in place of poses: as many as an uncertainty needs")] = None
     hold_s: Annotated[float, Field(ge=0.6, le=3600)] = 3.0
     repeat: Annotated[bool, Field(description="ask for the first pose once more at the end")] = True
     check_poses: Annotated[int, Field(ge=1, le=100)] = 6
@@ -55,6 +79,17 @@ class Plan(td.Strict):
             "waited for in any case",
         ),
     ] = 10.0
+
+    @property
+    def poses_most(self) -> int:
+        """The distinct poses of a full calibration; on demand the most."""
+        return self.poses if self.stop is None else self.stop.poses_most
+
+    @model_validator(mode="after")
+    def _one_end(self) -> Self:
+        if self.stop is not None and "poses" in self.model_fields_set:
+            raise ValueError("poses and stop: give one or the other")
+        return self
 
 
 class Limits(td.Strict):
@@ -120,10 +155,10 @@ WorkText = Annotated[str, AfterValidator(_work_text)]
 
 
 class Golden(td.Strict):
-    """A unit that is measured from time to time to check the station itself."""
+    """A unit that is verified from time to time to check the station itself."""
 
     serial: WorkText
-    every_h: Annotated[float, Field(gt=0, description="it is due so long after it was last measured")]
+    every_h: Annotated[float, Field(gt=0, description="it is due in each slot so long after it last verified there")]
     calibration: Annotated[
         PathText, Field(description="the calibration that it is known to have, beside the station file")
     ]
@@ -142,6 +177,10 @@ class Rules(td.Strict):
         False
     )
     golden: Golden | None = None
+
+    def of_golden(self, serial: str | None) -> bool:
+        """Whether this is the serial number of the golden unit."""
+        return self.golden is not None and serial is not None and same_serial(self.golden.serial, serial)
 
     @field_validator("serial")
     @classmethod
@@ -285,10 +324,29 @@ class StationFile(td.Strict):
         return self
 
     @model_validator(mode="after")
+    def _golden_is_judged(self) -> Self:
+        if self.rules.golden is not None and self.limits.verification_rms_g is None:
+            raise ValueError("rules.golden: give limits.verification_rms_g too, by which the golden unit is judged")
+        return self
+
+    @model_validator(mode="after")
     def _poses_fit_apart(self) -> Self:
-        for name in ("poses", "check_poses", "rezero_poses"):
-            if self.plan.apart_deg > _farthest_apart_deg(getattr(self.plan, name)):
-                raise ValueError(f"plan.{name}: there are not so many directions {self.plan.apart_deg:g} degrees apart")
+        plan = self.plan
+        most = "poses" if plan.stop is None else "stop.poses_most"
+        counts = {most: plan.poses_most, "check_poses": plan.check_poses, "rezero_poses": plan.rezero_poses}
+        for name, count in counts.items():
+            if plan.apart_deg > _farthest_apart_deg(count):
+                raise ValueError(f"plan.{name}: there are not so many directions {plan.apart_deg:g} degrees apart")
+        return self
+
+    @model_validator(mode="after")
+    def _stop_is_within_reach(self) -> Self:
+        """No pose lowers the uncertainty of the reference."""
+        reference = tc.Stated.at(self.latitude_deg, self.height_m, self.reference_uncertainty).reference
+        if self.plan.stop is not None and reference is not None and self.plan.stop.uncertainty_g <= reference:
+            raise ValueError(
+                f"plan.stop.uncertainty_g: out of reach, since the reference alone is uncertain by {reference:.2g} g"
+            )
         return self
 
     @field_validator("units")
@@ -441,7 +499,8 @@ def load_station(path: Path) -> Station:
         bundle = bundles[unit.profile]
         driver = td.driver_named(bundle.profile.driver, where=str(path))
         bus = td.toml_text.validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
-        if file.limits.verification_rms_g is not None and td.CORRECTED not in bundle.profile.streams:
+        judged = file.limits.verification_rms_g is not None and file.rules.golden is None  # which needs the limit too
+        if judged and td.CORRECTED not in bundle.profile.streams:
             raise InputError(
                 f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
             )

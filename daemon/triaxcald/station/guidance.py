@@ -47,7 +47,8 @@ class Guide:
     ``next`` is the next pose; None if the acquisition is complete, or if any pose not
     taken yet will do. ``too_short``: the present pose has to be held longer.
 
-    ``missing`` are the labels of the uncovered poses of the plan, in its order.
+    ``missing`` are the labels of the uncovered poses of the plan, in its order, or the
+    best one first where that is ``ranked``.
     ``repeat_due``: the first pose is wanted once more, after all others. ``at`` is the
     label of the present pose in the plan, None during a motion and off the plan.
     ``counted_s`` are times inside the poses that were long enough, for the next
@@ -68,6 +69,7 @@ class Guide:
     counted_s: tuple[float, ...] = ()
     only_near: bool = False
     """Whether poses keep coming in unwanted directions, so that they must suffice."""
+    ranked: bool = False
     taken: tuple[Vector, ...] = ()
     lacking: tuple[Vector, ...] = ()
     up: Vector | None = None
@@ -99,6 +101,7 @@ def guide(
     counted_s: Collection[float] = (),
     apart_from: tc.Floats | None = None,
     targets: Sequence[tc.planning.Direction] | None = None,
+    best_first: bool = False,
 ) -> Guide:
     """Judge the poses so far, which may come in any order; ``repeat`` asks for
     the first of them again at the end.
@@ -108,7 +111,8 @@ def guide(
     many as ``apart_from`` has.
 
     ``targets`` are the wanted directions, by default those of a plan with ``wanted``
-    poses.
+    poses. They are wanted in their order, or with ``best_first`` by how much each of
+    them lowers the uncertainty of the magnitude; ``wanted`` may be less than they are.
 
     ``now_s`` is the time of the latest sample, on the time scale of the poses. A pose
     around one of ``counted_s`` was long enough before: it still counts if its ends
@@ -143,6 +147,8 @@ def guide(
         )
     # A pose that does not count may cover a direction; at last that is wanted again.
     missing = (_uncovered(targets, held) or _uncovered(targets, distinct)) if found < wanted else ()
+    if best_first and missing:
+        missing = _best_first(targets, held, missing)
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
     at = next(iter(_covered(targets, up[-1:])), None) if still_s else None
     following = None
@@ -153,7 +159,7 @@ def guide(
     too_short = 0 < still_s < hold_s and not enough[-1]
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
     return Guide(
-        found, wanted, still_s, hold_s, following, too_short, missing, due, at, middles, only_near,
+        found, wanted, still_s, hold_s, following, too_short, missing, due, at, middles, only_near, best_first,
         taken=tuple(map(_vector, distinct)),
         lacking=tuple(_vector(v) for label, v in targets if label in missing),
         up=_vector(up[-1]) if still_s else None,
@@ -183,6 +189,17 @@ def _covered(targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats]
     nearest = np.argmax(cosines, axis=1)
     close = cosines[np.arange(len(held)), nearest] >= np.cos(np.radians(COVERED_DEG))
     return {targets[i][0] for i in nearest[close]}
+
+
+def _best_first(
+    targets: Sequence[tc.planning.Direction], held: Sequence[tc.Floats], missing: Sequence[str]
+) -> tuple[str, ...]:
+    """``missing``, the best next pose first. Directions of the plan stand for the poses
+    that cover them: measured ones move with the noise, and the order with them."""
+    covered = _covered(targets, held)
+    taken = np.array([v for label, v in targets if label in covered]).reshape(-1, 3)
+    left = [target for target in targets if target[0] in missing]
+    return tuple(label for label, _ in tc.planning.best_first(taken, left))
 
 
 def _pose_of(label: str, v: tc.Floats, *, once_more: bool = False) -> NextPose:

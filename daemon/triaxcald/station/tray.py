@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -36,12 +36,15 @@ class _Slot:
     """``into_unit`` (3,3) leads from the fixture's axes to the unit's, ``numbers`` from
     the labels of the slot's targets to directions of the fixture. ``wants`` are the
     directions that the slot lacks, ``again`` the one of these that it has taken before,
-    ``at`` is the direction of the present pose, which has lasted for ``held_s``."""
+    ``ranks`` those of the directions that it would rather have than others, the best
+    one 0; ``at`` is the direction of the present pose, which has lasted for
+    ``held_s``."""
 
     into_unit: tc.Floats
     numbers: dict[str, int]
     wants: frozenset[int] = frozenset()
     again: int | None = None
+    ranks: dict[int, int] = field(default_factory=dict)
     at: int | None = None
     held_s: float = 0.0
     here: bool = False
@@ -95,6 +98,7 @@ class Tray:
         due = guide.next if guide.repeat_due else None
         state.again = None if due is None else state.numbers.get(due.label)
         missing = () if guide.complete else guide.missing
+        state.ranks = {state.numbers[label]: rank for rank, label in enumerate(missing)} if guide.ranked else {}
         state.wants = frozenset(
             [*(state.numbers[label] for label in missing), *([] if state.again is None else [state.again])]
         )
@@ -137,6 +141,7 @@ class Tray:
         targets = [turned(self._directions[i], state.into_unit) for i in numbers]
         state.numbers = {label: i for (label, _), i in zip(targets, numbers, strict=True)}
         state.wants, state.again, state.at, state.held_s, state.here = frozenset(numbers), None, None, 0.0, True
+        state.ranks = {}
         self._present = self._chosen()
         return targets
 
@@ -156,6 +161,15 @@ class Tray:
         # An instruction stays until all have the pose.
         if self._present in lack and self._present not in waited_for:
             return self._present
-        # The pose that most lack; new ones before repeats, in the order of the plan.
+        # The pose that most lack; new ones before repeats, the best for those that lack
+        # it, in the order of the plan.
         left = lack.keys() - waited_for or lack.keys()
-        return min(left, key=lambda i: (-lack[i], all(s.again == i for s in here if i in s.wants), i))
+        return min(
+            left,
+            key=lambda i: (
+                -lack[i],
+                all(s.again == i for s in here if i in s.wants),
+                sum(s.ranks.get(i, 0) for s in here if i in s.wants),
+                i,
+            ),
+        )

@@ -22,7 +22,7 @@ from triaxcald.errors import DiskError
 from triaxcald.recording.reader import Recording
 from triaxcald.run import attempts, unit_run
 from triaxcald.run.attempts import FOLDER, ROOM, settle_killed
-from triaxcald.run.unit_run import Outcome, run_station
+from triaxcald.run.unit_run import Outcome, TrayRun
 from triaxcald.schema.codes import Stage
 from triaxcald.simulation.unit import ReferenceUnit
 from triaxcald.station.config import load_station
@@ -68,7 +68,7 @@ class Line:
 
     def run(self, progress: At) -> Outcome:
         async def work() -> list[Outcome]:
-            return await run_station(load_station(self.station), progress)
+            return await TrayRun(load_station(self.station), progress)
 
         unit: ReferenceUnit = described(self._device)
         with virtual_line(unit):

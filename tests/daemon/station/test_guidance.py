@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from triaxcal.model.directions import directions, elsewhere
+from triaxcal.planning import magnitude_error
 from triaxcal.poses.pose import Pose
 from triaxcald.station.faces import described
 from triaxcald.station.guidance import Guide, guide
@@ -203,3 +204,30 @@ def test_as_many_other_poses_as_the_fit_had_are_enough_where_these_are_few() -> 
     offered = [_pose(v, 5.0 * i) for i, v in enumerate(UP[:10])]
     assert not _guide(offered[:9], **settings).complete
     assert _guide(offered, **settings).complete
+
+
+def test_with_the_best_first_the_next_pose_is_the_one_that_lowers_the_uncertainty_most() -> None:
+    plan = directions(26)
+    state = _guide([_pose(v) for _, v in plan[:9]], wanted=26, targets=plan, best_first=True)
+    up = np.array([v for _, v in plan[:9]])
+    errors = [magnitude_error(np.concatenate([up, v[None]])) for label, v in plan[9:]]
+    assert state.next is not None
+    assert state.next.label == state.missing[0] == plan[9 + int(np.argmin(np.round(errors, 9)))][0]
+    assert sorted(state.missing) == sorted(label for label, _ in plan[9:])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_best_next_pose_does_not_change_with_the_noise_of_those_taken(seed: int) -> None:
+    plan, rng = directions(26), np.random.default_rng(seed)
+    off = [v + 0.03 * rng.standard_normal(3) for _, v in plan[:11]]
+    settings: dict[str, Any] = {"wanted": 26, "targets": plan, "best_first": True}
+    exact = _guide([_pose(v) for _, v in plan[:11]], **settings)
+    assert _guide([_pose(v / np.linalg.norm(v)) for v in off], **settings).missing == exact.missing
+
+
+def test_fewer_poses_than_the_plan_has_may_be_wanted() -> None:
+    poses = [_pose(v, start_s=10.0 * i) for i, (_, v) in enumerate(directions(26)[:12])]
+    settings: dict[str, Any] = {"targets": directions(26), "best_first": True}
+    assert not _guide(poses, wanted=26, **settings).complete
+    assert _guide(poses, wanted=12, **settings).complete
+    assert _guide(poses, wanted=12, repeat=True, **settings).repeat_due

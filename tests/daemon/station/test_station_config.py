@@ -143,6 +143,7 @@ def _tray(tmp_path: Path, old: str = "", new: str = "") -> Path:
     text = GOOD.replace('serial = "4711"', 'serial = "4711"\nmounting = "-y+x+z"').replace(
         "[[units]]", f"{TRAY}\n[[units]]", 1
     )
+    text = text.replace("\nrms_g = 5e-5", "\nverification_rms_g = 5e-5", 1)  # by which the golden unit is judged
     assert old in text
     path = tmp_path / "station.toml"
     path.write_text(text.replace(old, new, 1))
@@ -201,6 +202,7 @@ def test_fixture_rules_and_work_are_read(tmp_path: Path) -> None:
         ("every_h = 24", "every_h = 0", "line 19: rules.golden.every_h: input should be greater than 0, not 0"),
         ('serial = "0001"', 'serial = ""', "line 19: rules.golden.serial: expected 1 to 64 characters, not ''"),
         (', calibration = "golden.json"', "", "line 19: rules.golden.calibration: missing"),
+        ("verification_rms_g", "rms_g", "rules.golden: give limits.verification_rms_g too, by which the golden unit"),
         ('"Ada"', '""', "line 22: work.operator: expected 1 to 64 characters, not ''"),
         ('"Ada"', f'"{65 * "a"}"', "line 22: work.operator: expected 1 to 64 characters, not 'aaaa"),
         ('"Ada"', '"A\\u0007da"', "line 22: work.operator: expected printable characters alone"),
@@ -214,7 +216,7 @@ def test_a_fault_of_fixture_rules_or_work_is_said_with_file_line_and_key(
     with pytest.raises((InputError, DriverError)) as caught:
         load_station(path)
     message = str(caught.value)
-    assert message.startswith(f"{path}, {words}")
+    assert message.startswith((f"{path}, {words}", f"{path}: {words}"))
     assert "\n" not in message
 
 
@@ -437,3 +439,53 @@ def test_as_many_poses_as_a_sphere_has_room_for_are_allowed(
     else:
         with pytest.raises(DriverError, match=r"plan\.poses: there are not so many directions 60 degrees apart"):
             load_station(path)
+
+
+STOP = "stop = { uncertainty_g = 3e-5, poses_least = 10, poses_most = 20 }"
+
+
+def test_poses_on_demand_are_in_place_of_poses(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace("poses = 14", STOP, 1))
+    plan = load_station(path).file.plan
+    assert plan.stop is not None
+    assert (plan.stop.uncertainty_g, plan.stop.poses_least, plan.poses_most) == (3e-5, 10, 20)
+    path.write_text(GOOD.replace("poses = 14", "stop = { uncertainty_g = 3e-5 }", 1))
+    stop = load_station(path).file.plan.stop
+    assert stop is not None
+    assert (stop.poses_least, stop.poses_most) == (9, 26)
+    path.write_text(GOOD)
+    assert load_station(path).file.plan.poses_most == 14
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (f"poses = 14\n{STOP}", "plan: poses and stop: give one or the other"),
+        ("stop = {}", "plan.stop.uncertainty_g: missing"),
+        ("stop = { uncertainty_g = 0.0 }", "plan.stop.uncertainty_g: input should be greater than 0"),
+        ("stop = { uncertainty_g = 1e-5, poses_least = 8 }", "plan.stop.poses_least: input should be greater"),
+        ("stop = { uncertainty_g = 1e-5, poses_most = 1001 }", "plan.stop.poses_most: input should be less"),
+        ("stop = { uncertainty_g = 1e-5, poses_least = 27 }", "poses_least: 27 is above poses_most, 26"),
+        ("stop = { uncertainty_g = 1e-5, poses = 9 }", "plan.stop.poses: unknown key"),
+        (f"{STOP}\napart_deg = 60.0", "plan.stop.poses_most: there are not so many directions 60 degrees apart"),
+    ],
+)
+def test_a_fault_of_poses_on_demand_is_one_line(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace("poses = 14", line, 1))
+    with pytest.raises(DriverError) as caught:
+        load_station(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["reference_uncertainty = 3e-5", "latitude_deg = 50.0\nheight_m = 100.0"])
+def test_an_uncertainty_below_that_of_the_reference_is_out_of_reach(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "station.toml"
+    text = GOOD.replace('name = "bench"', f'name = "bench"\n{line}', 1)
+    path.write_text(text.replace("poses = 14", "stop = { uncertainty_g = 1e-5 }", 1))
+    with pytest.raises(DriverError, match=r"plan\.stop\.uncertainty_g: out of reach, since the reference alone is"):
+        load_station(path)
+    path.write_text(text.replace("poses = 14", "stop = { uncertainty_g = 1e-3 }", 1))
+    assert load_station(path).file.plan.stop is not None

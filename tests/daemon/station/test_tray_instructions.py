@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from triaxcal.model.directions import bias_directions, directions, elsewhere
+from triaxcal.planning import magnitude_error
 from triaxcal.poses.pose import Pose
 from triaxcald.mounting import rotation
 from triaxcald.station.faces import OWN_NAMES, described
@@ -426,3 +427,20 @@ def test_nobody_who_lacks_a_pose_means_no_instruction() -> None:
     assert tray.instruction() is None
     tray.targets("a", PLAN)
     assert tray.poses("a", Guide(14, 14, 3.0, 3.0)) is None
+
+
+def test_on_demand_the_fixture_takes_the_best_pose_and_a_slot_that_is_done_leaves() -> None:
+    """Slots need 12, 14 and 14 poses of the 26: the plan of the fixture is that of each unit."""
+    plan = directions(26)
+    line = Line({name: Unit(SLOTS[name]) for name in "abc"})
+    for name, unit in line.units.items():
+        targets = line.tray.targets(name, plan)
+        wanted = 12 if name == "b" else 14
+        unit.settings = {"wanted": wanted, "repeat": False, "targets": targets, "best_first": True}
+    assert line.turn_until_done() == 14
+    taken = [np.array(i.vector) for i in line.instructions]
+    for k in range(9, 14):
+        others = [v for _, v in plan if max(v @ t for t in taken[:k]) < 0.999]
+        best = min(magnitude_error(np.array([*taken[:k], v])) for v in others)
+        assert magnitude_error(np.array(taken[: k + 1])) == pytest.approx(best, rel=1e-5)
+    assert [i.slots for i in line.instructions] == [("a", "b", "c")] * 12 + [("a", "c")] * 2

@@ -23,6 +23,20 @@ def scan(page: Page, *texts: str) -> None:
         page.keyboard.press("Enter")
 
 
+def burst(page: Page, text: str) -> None:
+    """The same without a pause that a busy computer might make between two keys."""
+    page.evaluate(
+        """text => {
+          const field = document.activeElement;
+          for (const key of [...text, "Enter"]) {
+            field.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+            if (key !== "Enter") field.value += key;
+          }
+        }""",
+        text,
+    )
+
+
 def task(page: Page) -> str:
     return page.locator("#task-title").inner_text()
 
@@ -160,7 +174,8 @@ def test_a_missing_reason_is_asked_for_and_starts_the_tray(stage: Stage, opened:
     scan(page, "CMD:START")
     dialog = page.locator("#retest-dialog")
     expect(dialog).to_be_visible()
-    scan(page, "WO:4712")  # a scan while it is asked is a scan
+    expect(page.locator("#retest-reason")).to_be_focused()
+    burst(page, "WO:4712")  # a scan while it is asked is a scan
     expect(page.locator("#work")).to_contain_text("4712")
     expect(page.locator("#retest-reason")).to_have_value("")
     page.locator("#retest-reason").press_sequentially("customer return", delay=90)
@@ -279,6 +294,19 @@ def test_nothing_is_wider_than_the_page(stage: Stage, opened: Opened, size: tupl
     assert [right for right, edge in cards if right > edge] == []
 
 
+@pytest.mark.parametrize("language", ["en", "de", "uk"])
+@pytest.mark.parametrize("size", [(1920, 1080), (1280, 720), (1180, 820), (820, 1180)])
+def test_four_slots_at_work_are_in_sight_without_scrolling(
+    stage: Stage, opened: Opened, size: tuple[int, int], language: str
+) -> None:
+    in_poses(stage)
+    page = opened(f"/?lang={language}", viewport={"width": size[0], "height": size[1]})
+    expect(page.locator(".card .count")).to_have_count(4)
+    stage.live({slot: direction(3, 3, [0.0, 0.0, 1.0], 1.5) for slot in "abcd"})
+    expect(page.locator(".sphere")).to_have_count(4)
+    assert page.evaluate("document.documentElement.scrollHeight") <= size[1]
+
+
 def test_a_service_that_hangs_greys_the_page_within_5_s(stage: Stage, opened: Opened) -> None:
     in_poses(stage)
     page = opened()
@@ -299,6 +327,43 @@ def test_a_service_that_hangs_greys_the_page_within_5_s(stage: Stage, opened: Op
     expect(page.locator("#stale")).to_be_hidden()
     expect(page.locator("#task-title")).to_have_text("Edge A/Lid up")
     expect(page.locator("#stop")).to_be_enabled()
+
+
+def test_a_page_without_a_network_catches_up(stage: Stage, opened: Opened) -> None:
+    """As on a tablet that slept, or lost its wireless network."""
+    in_poses(stage)
+    page = opened()
+    expect(page.locator("#task-title")).to_have_text("Edge A/Lid up")
+    page.context.set_offline(True)
+    page.evaluate("window.stop()")  # ends the connections that are open
+    expect(page.locator("#stale")).to_be_visible(timeout=8000)
+    for slot in "abc":
+        stage.finish(slot)
+    stage.poses("d", 9)
+    page.context.set_offline(False)
+    expect(page.locator(".card.passed")).to_have_count(3)
+    expect(card(page, "d")).to_contain_text("Pose 9 of 14")
+    expect(page.locator("#stale")).to_be_hidden()
+
+
+def test_a_session_that_has_ended_leads_to_the_sign_in(opened: Opened) -> None:
+    page = opened()
+    expect(page.locator("#task-title")).to_have_text("Scan your badge")
+    answer = {"code": "not_signed_in", "message": "sign in as reader"}
+    page.route("**/api/1/events*", lambda route: route.fulfill(status=401, json=answer))
+    page.route("**/api/1/station", lambda route: route.fulfill(status=401, json=answer))
+    page.evaluate("window.stop()")
+    page.wait_for_url("**/sign-in?next=%2F")
+
+
+def test_other_slots_in_the_station_file_reach_the_page(stage: Stage, opened: Opened) -> None:
+    page = opened()
+    expect(page.locator(".card")).to_have_count(4)
+    station_file(stage.station.parent, "pq")
+    with page.expect_navigation():
+        stage.do(stage.floor.reload)
+    expect(page.locator(".card")).to_have_count(2)
+    assert '"slots": ["p", "q"]' in (page.locator("body").get_attribute("data-page") or "")
 
 
 def test_a_restarted_service_is_found_again_and_nothing_scanned_is_lost(stage: Stage, opened: Opened) -> None:
@@ -366,6 +431,7 @@ def test_the_stream_alone_tells_the_state(stage: Stage, opened: Opened) -> None:
     """No request asks for it, and events between two states lead to what the service has."""
     asked: list[str] = []
     page = opened()
+    expect(page.locator(".card.empty")).to_have_count(4)
     page.on("request", lambda request: asked.append(request.url))
     in_poses(stage)
     stage.say("lost", "b", code="lost", reason="no answer for 2 s")

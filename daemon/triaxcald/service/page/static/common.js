@@ -68,12 +68,15 @@ export function explained(refused) {
   };
 }
 
+/** To the sign-in, and back here from there. */
+export function signIn() {
+  location.assign(`/sign-in?next=${encodeURIComponent(location.pathname + location.search)}`);
+}
+
 /** In place of what could not be loaded. */
 export function failure(error) {
   if (!(error instanceof Refused)) throw error;
-  if (error.code === "not_signed_in") {
-    location.assign(`/sign-in?next=${encodeURIComponent(location.pathname + location.search)}`);
-  }
+  if (error.code === "not_signed_in") signIn();
   const { title, advice, detail } = explained(error);
   return element("div", { class: "alarm error", role: "alert" },
     element("div", {}, element("strong", {}, title), element("span", {}, advice), element("small", {}, detail)));
@@ -90,13 +93,12 @@ export const clockOf = (text) => clock.format(text === undefined ? new Date() : 
 export function figure(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
-  if (size !== 0 && (size < 1e-4 || size >= 1e7)) {
-    const [mantissa, power] = value.toExponential(digits - 1).split("e");
-    return `${Number(mantissa).toLocaleString(locale, { maximumFractionDigits: digits - 1 })} × 10${raised(Number(power))}`;
-  }
-  return value.toLocaleString(locale, { maximumSignificantDigits: digits });
+  if (size === 0 || (size >= 1e-4 && size < 1e7)) return signed(value.toLocaleString(locale, { maximumSignificantDigits: digits }));
+  const [mantissa, power] = value.toExponential(digits - 1).split("e");
+  return `${signed(Number(mantissa).toLocaleString(locale, { maximumFractionDigits: digits - 1 }))} × 10${raised(Number(power))}`;
 }
 
+const signed = (text) => text.replace("-", "−");
 const raised = (power) => [...String(power)].map((c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]).join("");
 
 export const decimal = (value, places) =>

@@ -1,6 +1,8 @@
 // The station's state as its event stream tells it: whole states, and events between
 // them, as service/desk.py takes them.
 
+import { ask, signIn } from "./common.js";
+
 export const ENDED = { pass: "passed", fail: "failed", aborted: "aborted", not_judged: "not_judged" };
 export const VERDICTS = Object.fromEntries(Object.entries(ENDED).map(([verdict, state]) => [state, verdict]));
 export const atWork = (slot) => slot.state === "running" || slot.state === "lost";
@@ -105,6 +107,13 @@ export class Following {
       this.#silent = true;
       this.silent(true, this.at ?? null);
     }
-    if (now - this.#opened >= AGAIN_MS) this.#open();
+    if (now - this.#opened < AGAIN_MS) return;
+    if (this.#source.readyState === EventSource.CLOSED) this.#askWhy();
+    this.#open();
+  }
+
+  // A refused stream does not tell why: the session may have ended.
+  #askWhy() {
+    ask("/api/1/station").catch((error) => error.code === "not_signed_in" && signIn());
   }
 }

@@ -61,7 +61,7 @@ function tasksAtWork(now, working, named) {
       title: pose, tilt, up: instruction.vector, slots: named(these), tone: "act",
       more: once_more ? word("task.once_more") : "",
     });
-  } else if (running.some((s) => COLLECTING.includes(s.stage))) {
+  } else if (running.some((s) => COLLECTING.includes(s.stage) && s.wanted > 0)) {
     const one = working.length === 1 || page.together;
     tasks.push({ title: word(one ? "task.any_pose" : "task.turn_each"), tone: "act" });
   }
@@ -426,8 +426,18 @@ function typed(e) {
 
 window.addEventListener("keydown", typed, true);
 
+/** Loads the page anew if the station file was read again and has other slots; once for
+ * the same slots. */
+function loadIfChanged(now) {
+  const slots = now.slots.map((s) => s.slot).join("\n");
+  if (slots === page.slots.join("\n") || sessionStorage.getItem("loaded_for") === slots) return;
+  sessionStorage.setItem("loaded_for", slots);
+  location.reload();
+}
+
 new Following({
   shown(now) {
+    loadIfChanged(now);
     const before = state;
     state = now;
     if (before?.tray !== now.tray) request = null;
