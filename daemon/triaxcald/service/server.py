@@ -89,6 +89,8 @@ async def serve(
     Raises DaemonError."""
     with alone(station.folder), bound(address) as listening:
         ledger = await asyncio.to_thread(Ledger.open, station, database)
+        if ledger.lost is not None:
+            log(f"triaxcal: {ledger.lost}")
         hosts = known_hosts(address.host, listening.getsockname()[1], secure=address.secure)
         try:
             async with _working(station, ledger, address, hosts, log) as service:
