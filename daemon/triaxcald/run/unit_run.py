@@ -579,14 +579,14 @@ class UnitRun(UnitSession):
         apart_from: tc.Floats | None = None,
     ) -> None:
         plan, targets, on_demand = self.station.file.plan, None, None
-        if self.rezero is None and stream == td.READINGS and plan.stop is not None:
+        if self._golden is not None:
+            plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
+        elif self.rezero is None and stream == td.READINGS and plan.stop is not None:
             judge = Judge.of(plan.stop, self.place, self.station.file)
             on_demand = OnDemand(judge, repeat=plan.repeat, tell=partial(self._judged, writer))
             targets = on_demand.targets
         elif self.rezero is not None and stream == td.READINGS:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
-        if self._golden is not None:
-            plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
         if self.tray is not None:
             targets = (
                 self.tray.targets(self.name, targets or tc.planning.directions(wanted))

@@ -197,6 +197,20 @@ def test_an_audit_finds_a_forged_verification(
     assert triaxcal("audit", forgery.write(tmp_path / "forged.mcap")).code == 1
 
 
+def test_poses_on_demand_are_for_calibrations_alone(
+    bench: Callable[..., Any], workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    calibration(workshop.folder)
+    stop = {"uncertainty_g": 1e-6, "poses_least": 9, "poses_most": 20}
+    plan = {key: value for key, value in PLAN.items() if key != "poses"} | {"stop": stop}
+    with bench(EXACT, without_corrected(workshop), plan=plan) as station:
+        done = triaxcal("run", station, "--serial", f"a={GOLDEN}", "--events")
+    assert done.code == 0, done.err
+    poses = [e for line in done.out.splitlines() if (e := json.loads(line))["event"] == "poses"]
+    assert {e["wanted"] for e in poses} == {PLAN["check_poses"]}
+    assert triaxcal("audit", next(workshop.folder.glob("*.mcap"))).code == 0
+
+
 def test_the_rules_for_products_do_not_hold_for_it(
     bench: Callable[..., Any], workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
