@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 
 from tests.conftest import Workshop
+from tests.daemon.run.test_tray_run import MOUNTINGS, _mounted
 from tests.virtual_line import described, virtual_line
 from triaxcald.audit import audit
 from triaxcald.audit.conduct import Result
 from triaxcald.cli.commands import main
 from triaxcald.recording.reader import Recording
-from triaxcald.station.on_demand import CONFIRMING
+from triaxcald.station.on_demand import CONFIRMING, LEFT_LEAST
 
 BUS = {"host": "127.0.0.1", "port": 502}
 STOP = {"uncertainty_g": 1e-4, "poses_least": 9, "poses_most": 26}
@@ -105,3 +106,31 @@ def test_an_uncertainty_that_is_not_reached_takes_the_most_poses(tmp_path: Path)
     assert {wanted for _, wanted in found.told} == {12}
     assert found.told[-1] == (12, 12)
     assert found.judged == []  # the noise alone is above it
+
+
+@pytest.mark.slow
+def test_units_of_one_fixture_end_each_by_itself(tmp_path: Path) -> None:
+    """The noise of the second is five times that of the first."""
+    workshop, units, slots = Workshop(tmp_path), [], []
+    for i, (name, mounting) in enumerate(MOUNTINGS.items()):
+        bus, serial = {"host": "127.0.0.1", "port": 502 + i}, 4711 + i
+        noise = {"noise_g": 2e-4 * 5**i}
+        fixture = {"poses": 26, "hold_s": 3.0, "move_s": 0.8}
+        device = workshop.device(f"{name}.toml", bus=bus, serial=serial, fixture=fixture, seed=3 + i, sensor=noise)
+        units.append(_mounted(device, mounting))
+        slots.append({"name": name, "serial": str(serial), "mounting": mounting, "bus": bus})
+    plan = {"stop": {"uncertainty_g": 5e-5}, "hold_s": 1.0, "repeat": False}
+    station = workshop.station(
+        *slots, plan=plan, fixture={"together": True}, limits={"rms_g": 1e-3}, provisioning={"write": False}
+    )
+    out, err = io.StringIO(), io.StringIO()
+    with virtual_line(*units), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        assert main(["run", str(station), "--json"]) == 0, err.getvalue()
+    taken = {}
+    for unit in json.loads(out.getvalue())["units"]:
+        found = json.loads(Path(unit["certificate"]).read_text())
+        taken[unit["unit"]] = found["recording"]["poses"]
+        assert found["result"]["calibration"]["uncertainty"]["magnitude"]["standard_g"] <= 5e-5
+        assert main(["audit", unit["recording"]]) == 0
+    left, right = taken.values()
+    assert 9 + LEFT_LEAST + CONFIRMING <= left < right <= 26
