@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing, asynccontextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 from triaxcald.service.database import DatabaseError
 from triaxcald.service.ledger import Ledger
 from triaxcald.service.stream import LISTENER_MOST, Message, Stream, TooSlow
+from triaxcald.simulation.follow import ServiceEvents
 from triaxcald.station.config import Station
 
 
@@ -142,3 +145,40 @@ async def test_events_go_on_while_the_database_fails() -> None:
         emit(stream, 1)
         assert await listening == [("state", 7), ("event", 8)]
         assert stream.trouble == "no space"
+
+
+def test_a_simulated_tray_hears_each_event_once_across_a_restart_of_the_service() -> None:
+    """Bytes of server-sent events as the service sends them; the second connection asks for what it missed."""
+    asked: list[str] = []
+    heard_lines: list[bytes] = []
+    state = b'id: 4\nevent: state\ndata: {"seq": 4}\n\n'
+    answers = [
+        state + b'id: 5\nevent: event\ndata: {"seq": 5}\n\nevent: alive\ndata: {}\n\n',
+        b'id: 6\nevent: state\ndata: {"seq": 6}\n\nid: 6\nevent: event\r\ndata: {"seq": 6}\r\n\r\n',
+    ]
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(answers[min(len(asked), 2) - 1])
+
+        def log_message(self, format: str, *args: object) -> None: ...
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        events = ServiceEvents(f"http://127.0.0.1:{server.server_address[1]}")
+        enough = threading.Event()
+
+        def tell(data: bytes | None) -> None:
+            assert data is not None
+            heard_lines.append(data)
+            if len(heard_lines) == 2:
+                enough.set()
+
+        threading.Thread(target=events.read, args=(tell,), daemon=True).start()
+        assert enough.wait(30)
+        server.shutdown()
+    assert heard_lines[:2] == [b'{"seq": 5}\n', b'{"seq": 6}\n']
+    assert asked[:2] == ["/api/1/events", "/api/1/events?after=5"]

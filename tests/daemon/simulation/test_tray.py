@@ -323,7 +323,7 @@ def test_units_on_free_ports_and_on_other_nodes_go_together(workshop: Any) -> No
     assert len({id(u.time_base) for u in tray.units}) == 1
 
 
-@pytest.mark.parametrize("followed", ["http://127.0.0.1:8000/events", "https://line", "none.jsonl", "."])
+@pytest.mark.parametrize("followed", ["none.jsonl", "."])
 def test_what_cannot_be_followed(workshop: Any, triaxcal: Callable[..., Any], followed: str) -> None:
     triaxcal("sim", left(workshop), "--follow", followed).failed(2, followed)
 
