@@ -56,31 +56,26 @@ function characteristics(list, pick) {
       })))));
 }
 
-/** Individuals and moving ranges of a characteristic. */
-function charts({ name, unit: given, low, high, chart }) {
-  const { points, individuals, moving_range } = chart;
+/** Individuals and moving ranges of a characteristic: a `triaxcal.chart/1`. */
+function charts({ name, unit: given, points, centre, low, high, mr_mean, mr_high, limit }) {
   if (points.length < 2) return [element("p", { class: "muted" }, word("quality.few"))];
   const { factor, unit } = scaleOf(name, given);
   const scaled = (value) => (value === null ? null : value * factor);
   const title = (kind) => `${characteristicName(name)}${unit ? `, ${unit}` : ""}: ${word(kind)}`;
-  const linesOf = ({ centre, lower, upper }, limits) => [
-    { value: scaled(centre), kind: "centre" },
-    ...[lower, upper].map((value) => ({ value: scaled(value), kind: "control" })),
-    ...limits.map((value) => ({ value: scaled(value), kind: "spec" })),
-  ];
+  const lines = (kinds) => Object.entries(kinds).flatMap(([kind, values]) => values.map((value) => ({ value: scaled(value), kind })));
   const marked = (point, value, mark) => ({
     value: scaled(value), mark, href: `/runs/${encodeURIComponent(point.run)}`,
     label: [point.serial, timeOf(point.time), amount(name, given, value, 5)].filter(Boolean).join(", "),
   });
-  const ruled = ({ rules }) => (rules.includes("outside") ? "outside" : rules.includes("run") ? "run" : null);
-  const ranges = points.map((point, i) => (i ? Math.abs(point.value - points[i - 1].value) : null));
+  const ruled = ({ outside }) => (outside === "limits" ? "outside" : outside);
   return [
     fitted(title("quality.individuals"), (at) => controlChart({
-      ...at, lines: linesOf(individuals, [low, high]), points: points.map((point) => marked(point, point.value, ruled(point))),
+      ...at, lines: lines({ centre: [centre], control: [low, high], spec: [limit] }),
+      points: points.map((point) => marked(point, point.value, ruled(point))),
     })),
     fitted(title("quality.moving_range"), (at) => controlChart({
-      ...at, lines: linesOf(moving_range, []), height: 180,
-      points: points.map((point, i) => marked(point, ranges[i], ranges[i] > moving_range.upper ? "outside" : null)),
+      ...at, lines: lines({ centre: [mr_mean], control: [mr_high] }), height: 180,
+      points: points.map((point) => marked(point, point.moving_range, point.moving_range_outside ? "outside" : null)),
     })),
     element("p", { class: "muted" }, word("quality.chart_note")),
   ];
@@ -93,7 +88,16 @@ try {
     const list = q.characteristics;
     const place = element("div");
     const choice = element("select", { id: "characteristic" }, list.map((c) => element("option", { value: c.name }, characteristicName(c.name))));
-    const show = () => place.replaceChildren(...charts(list.find((c) => c.name === choice.value)));
+    const show = async () => {
+      const name = choice.value;
+      let drawn;
+      try {
+        drawn = charts(await ask(`/api/1/charts?${asked(["name", name])}`));
+      } catch (error) {
+        drawn = [failure(error)];
+      }
+      if (name === choice.value) place.replaceChildren(...drawn);
+    };
     const pick = (name) => {
       choice.value = name;
       show();
@@ -107,7 +111,7 @@ try {
         element("div", { class: "pick" }, element("label", { for: "characteristic" }, word("quality.chart")), choice), place) : null,
       list.length ? characteristics(list, pick) : null,
     ].filter(Boolean));
-    if (list.length) show();
+    if (list.length) await show();
   }
 } catch (error) {
   content.replaceChildren(failure(error));
