@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import gc
 import json
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AsyncExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from triaxcald.cli.syntax import writable
 from triaxcald.decoded import beside_samples
 from triaxcald.errors import DISK, INTERRUPTED, InputError, severest
 from triaxcald.files import require_new, require_recording, unused
+from triaxcald.memory import little_garbage
 from triaxcald.printable import printable_json
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
@@ -85,11 +85,6 @@ AGAIN_S = 60.0
 on."""
 
 
-GARBAGE_LEAST = 10_000
-"""Objects more than before after which garbage is looked for. Python's 700 come
-several times a second on a busy bus, hardly ever with a cycle among them."""
-
-
 @dataclass(frozen=True)
 class _Chosen:
     """Units and buses of a station that are to be recorded."""
@@ -108,7 +103,7 @@ class _Chosen:
 
 
 def record_command(a: argparse.Namespace) -> int:
-    with _little_garbage():
+    with little_garbage():
         return _recorded(a)
 
 
@@ -127,19 +122,6 @@ def _recorded(a: argparse.Namespace) -> int:
         kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if a.folder else None)
     # None is left where it was stopped in the midst of a reload.
     return severest(k.exit_code for k in kept) if kept else INTERRUPTED
-
-
-@contextmanager
-def _little_garbage() -> Iterator[None]:
-    """Reduce garbage collection: never of imported modules, seldom of the rest."""
-    thresholds = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(GARBAGE_LEAST, *thresholds[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*thresholds)
-        gc.unfreeze()
 
 
 def _load(a: argparse.Namespace) -> _Chosen:

@@ -16,6 +16,7 @@ from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.stations import simulated
 from triaxcald.errors import InputError
+from triaxcald.memory import little_garbage
 from triaxcald.station.config import Station, check_lines, load_station
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def serve_command(a: argparse.Namespace) -> int:
         ready=lambda url, _: say(f"serving {station.file.name} at {url}; Ctrl-C stops it"),
     )  # fmt: skip
     try:
-        run_interruptible(work, reload.set)
+        with little_garbage():  # a full collection would delay the event loop
+            run_interruptible(work, reload.set)
     except Interrupted as e:
         if e.number == signal.SIGINT:
             raise
