@@ -32,7 +32,7 @@ async def service(workshop: Workshop) -> AsyncIterator[Guarded]:
 
 async def still_works(service: Guarded) -> None:
     assert (await scan(service)).status_code == 200
-    assert service.rows()[-1]["ok"]
+    assert [row["ok"] for row in service.rows() if row["action"] == "scan"][-1]  # refusals may follow it
 
 
 async def raw(service: Guarded, data: bytes) -> tuple[int, dict[str, str]]:
