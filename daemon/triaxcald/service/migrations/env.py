@@ -1,5 +1,5 @@
 """Alembic runs the migrations on the connection that `triaxcald.service.database`
-hands over."""
+hands over. Imported by itself it does nothing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from alembic import context
 
 from triaxcald.service.tables import metadata
 
-connection = context.config.attributes["connection"]
-context.configure(connection=connection, target_metadata=metadata)
-with context.begin_transaction():
-    context.run_migrations()
+config = getattr(context, "config", None)
+if config is not None:
+    context.configure(connection=config.attributes["connection"], target_metadata=metadata)
+    with context.begin_transaction():
+        context.run_migrations()

@@ -19,8 +19,9 @@ QUIET = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """For the tests of one file: while Playwright is there, its loop runs in this thread, and no other may."""
     if CHROMIUM is None:
         pytest.skip("there is no chromium (apt-get install chromium)")
     with sync_playwright() as playwright:
