@@ -21,6 +21,8 @@ DEADLINE_S = 60  # of processor time; a command that takes so long is ended by t
 
 
 PACKAGES = ("triaxcal", "triaxcal_drivers", "triaxcald")
+APART = "triaxcald.service."
+"""The web and its database, which no command on a file imports."""
 FURTHER = ("canopen", "pyarrow.csv", "pyarrow.parquet")  # what is not imported before it is needed
 
 
@@ -28,7 +30,7 @@ def main() -> None:
     begin = time.process_time()
     for package in map(importlib.import_module, PACKAGES):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-            if not module.name.endswith("__main__"):
+            if not module.name.endswith("__main__") and not module.name.startswith(APART):
                 importlib.import_module(module.name)
     for name in FURTHER:
         importlib.import_module(name)
