@@ -40,8 +40,6 @@ LIVE_S: Final = 0.4
 DAY_S: Final = 86_400.0
 DUE_LATE_S: Final = 0.1
 """A golden unit is shown as due so long after the moment, so that it surely is."""
-AGAIN_S: Final = 5.0
-"""Pause before runs enter a database that did not answer."""
 DESK: Final = "desk"
 """Key of what is kept of the desk."""
 
@@ -92,7 +90,6 @@ class Floor:
         self._starting = asyncio.Lock()
         self._entering = asyncio.Lock()
         self._again = False
-        self._later: asyncio.Task[None] | None = None
         self._stopping = False
         self._saved: dict[str, Any] | None = None
         self._checks: dict[str, golden.LastCheck] = {}
@@ -259,8 +256,6 @@ class Floor:
                     await asyncio.wait([task])
                 except asyncio.CancelledError:
                     task.cancel()
-        if self._later is not None:
-            self._later.cancel()
         await self._save()
 
     # A tray.
@@ -386,7 +381,7 @@ class Floor:
             station = await asyncio.to_thread(self._load)
             station.require_units()
             await asyncio.to_thread(golden_calibration, station)
-        except (DaemonError, Exception) as e:  # noqa: BLE001 - the old station file stays in use
+        except Exception as e:  # noqa: BLE001 - the old station file stays in use
             self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
             return
         kept = self.desk.kept()

@@ -21,6 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from triaxcald.errors import DaemonError
 from triaxcald.inputs import measure
 from triaxcald.schema.codes import Code, Stage, Verdict
+from triaxcald.service.api import Access
 from triaxcald.service.errors import ApiError, Problem
 from triaxcald.station.config import Station
 
@@ -41,11 +42,6 @@ TYPES: Final = {
 }
 PAGES: Final = (("station", "/"), ("runs", "/runs"), ("quality", "/quality"))
 """In the head of every page."""
-
-
-class Access(Protocol):
-    async def require(self, request: Request, role: str) -> Any:
-        """Who asks. Raises ApiError."""
 
 
 class Ledger(Protocol):
