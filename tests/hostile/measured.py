@@ -1,5 +1,6 @@
 """Runs commands one after the other, each in a process of its own, and says what each took: the whole program is
-imported once and each command is a fork of it, so that a row of the table takes what its command takes and no more.
+imported once and each command is a fork of it. The memory of a row is what its command takes beyond a fork that does
+nothing, so that it does not depend on what else the program imports.
 
 Reads a JSON list of [folder, words] on standard input; writes a JSON object: the seconds of processor time that the
 imports took, and what came of each command.
@@ -35,10 +36,19 @@ def main() -> None:
     for name in FURTHER:
         importlib.import_module(name)
     seconds = time.process_time() - begin
-    sys.stdout.write(json.dumps({"imports": seconds, "commands": [_run(*row) for row in json.load(sys.stdin)]}))
+    idle = _idle()
+    sys.stdout.write(json.dumps({"imports": seconds, "commands": [_run(*row, idle) for row in json.load(sys.stdin)]}))
 
 
-def _run(folder: str, words: list[str]) -> dict[str, Any]:
+def _idle() -> int:
+    """The most bytes that a fork has in memory when it does nothing."""
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    return os.wait4(child, 0)[2].ru_maxrss * 1024
+
+
+def _run(folder: str, words: list[str], idle: int) -> dict[str, Any]:
     child = os.fork()
     if child == 0:
         _be(folder, words)
@@ -49,7 +59,7 @@ def _run(folder: str, words: list[str]) -> dict[str, Any]:
         "code": os.waitstatus_to_exitcode(status),
         "told": told,
         "seconds": used.ru_utime + used.ru_stime,
-        "bytes": used.ru_maxrss * 1024,
+        "bytes": used.ru_maxrss * 1024 - idle,
     }
 
 
