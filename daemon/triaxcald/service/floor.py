@@ -40,6 +40,8 @@ LIVE_S: Final = 0.4
 DAY_S: Final = 86_400.0
 DUE_LATE_S: Final = 0.1
 """A golden unit is shown as due so long after the moment, so that it surely is."""
+RETRY_S: Final = 2.0
+"""Time until a database that has failed is asked again."""
 DESK: Final = "desk"
 """Key of what is kept of the desk."""
 
@@ -89,6 +91,9 @@ class Floor:
         self._task: asyncio.Task[None] | None = None
         self._starting = asyncio.Lock()
         self._entering = asyncio.Lock()
+        self._saving = asyncio.Lock()
+        self._retry: asyncio.TimerHandle | None = None
+        self._told: set[str] = set()
         self._again = False
         self._stopping = False
         self._saved: dict[str, Any] | None = None
@@ -246,8 +251,9 @@ class Floor:
         """Stop what is at work, and wait until each device is in order. Each
         cancellation meanwhile is passed on to the units."""
         self._stopping = True
-        if self._due_timer is not None:
-            self._due_timer.cancel()
+        for timer in (self._due_timer, self._retry):
+            if timer is not None:
+                timer.cancel()
         if (task := self._task) is not None:
             for slot in self.desk.slots:
                 self._stop(slot, "the service was stopped")
@@ -325,11 +331,27 @@ class Floor:
                 self.desk.ended(slot.slot, document, now())
 
     async def _enter(self) -> None:
-        """Bring the database up to date with the folder."""
+        """Bring the database up to date with the folder, later if it fails."""
         try:
             await self._take()
         except DaemonError as e:
-            self._log(f"triaxcal: {e}")
+            self._later(e)
+
+    def _later(self, error: DaemonError) -> None:
+        """Enter and save in a while what the database has not taken."""
+        if str(error) not in self._told:  # once, not with each attempt
+            self._log(f"triaxcal: {error}")
+        self._told.add(str(error))
+        if self._retry is None and not self._stopping:
+            self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._again_now)
+
+    def _again_now(self) -> None:
+        async def again() -> None:
+            await self._enter()
+            await self._save()
+
+        self._retry = None
+        _keep_alive(asyncio.ensure_future(again()))
 
     async def _take(self) -> None:
         """Bring the database up to date with the folder. Raises DaemonError."""
@@ -338,6 +360,7 @@ class Floor:
             rule, before = self.station.file.rules.golden, self._checks
             slots = list(self.desk.slots)
             self._checks = {} if rule is None else await asyncio.to_thread(self._book.golden, rule.serial, slots)
+        self._told.clear()
         self._recorded()
         self._await_due()
         if self._checks != before:
@@ -365,15 +388,16 @@ class Floor:
         await self._save()
 
     async def _save(self) -> None:
-        """Keep the desk for a restart."""
-        kept = self.desk.kept()
-        if kept == self._saved:
-            return
-        try:
-            await asyncio.to_thread(self._book.put_setting, DESK, kept)
-            self._saved = kept
-        except DaemonError as e:
-            self._log(f"triaxcal: {e}")
+        """Keep the desk for a restart, later if the database fails."""
+        async with self._saving:  # an earlier state never replaces a later one
+            kept = self.desk.kept()
+            if kept == self._saved:
+                return
+            try:
+                await asyncio.to_thread(self._book.put_setting, DESK, kept)
+                self._saved = kept
+            except DaemonError as e:
+                self._later(e)
 
     async def _reloaded(self) -> None:
         self._again = False

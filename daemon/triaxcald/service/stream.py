@@ -1,11 +1,12 @@
 """The events of the station for whoever listens: each is stored before it is sent, so
-that its number is never given twice, and sent to every listener in the same order."""
+that its number is never given twice, and sent to every listener in the same order.
+While the store fails, events are sent all the same and stored when it answers again."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
@@ -17,6 +18,8 @@ LISTENER_MOST: Final = 2_000
 comes again with the number of the last event that it had."""
 TOGETHER_MOST: Final = 200
 """Events that are stored in one transaction."""
+RETRY_S: Final = 2.0
+"""Time until a store that has failed is asked again."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,8 @@ class Stream:
         self._closed = False
         self.trouble: str | None = None
         """Why the latest events are not stored."""
+        self._unstored: deque[dict[str, Any]] = deque(maxlen=kept)
+        self._retry_at_s = 0.0
 
     async def begin(self) -> None:
         """Go on after the last stored event. Raises DaemonError."""
@@ -111,30 +116,43 @@ class Stream:
         """Store and send, until cancelled; what waits then is stored first."""
         try:
             while True:
-                await self._news.wait()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(RETRY_S if self._unstored else None):
+                        await self._news.wait()
                 self._news.clear()
+                await self._keep(())
                 while self._waiting:
                     await self._forward()
                 self._idle.set()
         finally:
-            events = [dict(m.data) for m in self._waiting if m.kind == "event"]
+            events = [*self._unstored, *(dict(m.data) for m in self._waiting if m.kind == "event")]
             if events:
                 with suppress(DaemonError):
                     self._store.append(events)
 
     async def _forward(self) -> None:
         together = [self._waiting[i] for i in range(min(len(self._waiting), TOGETHER_MOST))]
-        events = [dict(m.data) for m in together if m.kind == "event"]
-        if events:
-            try:
-                await asyncio.to_thread(self._store.append, events)
-                self.trouble = None
-            except DaemonError as e:  # the work goes on, and is in the recordings
-                self.trouble = str(e)
+        await self._keep([dict(m.data) for m in together if m.kind == "event"])
         for message in together:
             self._waiting.popleft()
             for listener in self._listeners:
                 listener.tell(message)
+
+    async def _keep(self, events: Sequence[dict[str, Any]]) -> None:
+        """Store these events and those that an earlier failure has left."""
+        self._unstored.extend(events)
+        if not self._unstored or asyncio.get_running_loop().time() < self._retry_at_s:
+            return
+        before = self.trouble
+        try:
+            await asyncio.to_thread(self._store.append, list(self._unstored))
+            self._unstored.clear()
+            self.trouble = None
+        except DaemonError as e:  # the work goes on, and is in the recordings
+            self.trouble = str(e)
+            self._retry_at_s = asyncio.get_running_loop().time() + RETRY_S
+        if (before is None) != (self.trouble is None):
+            self.changed()
 
     async def listen(self, after: int | None = None) -> AsyncGenerator[Message]:
         """The present state; then the events behind ``after`` if they are kept, else
@@ -167,10 +185,11 @@ class Stream:
             self._listeners.discard(listener)
 
     async def _missed(self, after: int) -> list[dict[str, Any]]:
-        try:
-            return await asyncio.to_thread(self._store.events_after, after, self._kept)
-        except DaemonError:
-            return []
+        stored: list[dict[str, Any]] = []
+        with suppress(DaemonError):
+            stored = await asyncio.to_thread(self._store.events_after, after, self._kept)
+        last = stored[-1]["seq"] if stored else after
+        return [*stored, *(event for event in self._unstored if event["seq"] > last)]
 
     @property
     def listeners(self) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from triaxcald.service import stream as stream_module
 from triaxcald.service.database import DatabaseError
 from triaxcald.service.ledger import Ledger
 from triaxcald.service.stream import LISTENER_MOST, Message, Stream, TooSlow
@@ -124,27 +125,69 @@ async def test_listening_ends_with_the_stream(ledger: Ledger) -> None:
         assert await listening == [("state", 0), ("event", 1)]
 
 
-class Broken:
-    """A database that fails."""
+class Failing:
+    """A database that fails while it is told to."""
+
+    def __init__(self) -> None:
+        self.fails = True
+        self.kept: list[int] = []
 
     def append(self, events: list[dict[str, Any]]) -> None:
-        raise DatabaseError("no space")
+        if self.fails:
+            raise DatabaseError("no space")
+        self.kept += [event["seq"] for event in events]
 
     def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]:
-        raise DatabaseError("no space")
+        if self.fails:
+            raise DatabaseError("no space")
+        return [{"seq": kept} for kept in self.kept if kept > seq]
 
     def last_seq(self) -> int:
         return 7
 
 
-async def test_events_go_on_while_the_database_fails() -> None:
-    async with flowing(Broken()) as stream:
-        listening = asyncio.ensure_future(heard(stream, 2, after=6))
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Failing:
+    monkeypatch.setattr(stream_module, "RETRY_S", 0.01)
+    return Failing()
+
+
+async def test_events_go_on_while_the_database_fails(failing: Failing) -> None:
+    async with flowing(failing) as stream:
+        listening = asyncio.ensure_future(heard(stream, 3, after=6))
         while not stream.listeners:
             await asyncio.sleep(0)
         emit(stream, 1)
-        assert await listening == [("state", 7), ("event", 8)]
+        assert await listening == [("state", 7), ("event", 8), ("state", 8)]  # the state says that it fails
         assert stream.trouble == "no space"
+
+
+async def test_what_a_failing_database_did_not_take_is_stored_when_it_answers_again(failing: Failing) -> None:
+    async with flowing(failing) as stream:
+        emit(stream, 2)
+        await stream.drained()
+        emit(stream, 1)
+        await stream.drained()
+        assert await heard(stream, 3, after=8) == [("state", 10), ("event", 9), ("event", 10)]
+        failing.fails = False  # and no further event comes
+        async with aclosing(stream.listen()) as messages:
+            await anext(messages)
+            async with asyncio.timeout(20):
+                assert (await anext(messages)).kind == "state"
+        assert stream.trouble is None
+        assert failing.kept == [8, 9, 10]
+        emit(stream, 1)
+        await stream.drained()
+    assert failing.kept == [8, 9, 10, 11]
+
+
+async def test_what_a_failing_database_did_not_take_is_stored_at_the_end(failing: Failing) -> None:
+    async with flowing(failing) as stream:
+        stream._retry_at_s = float("inf")
+        emit(stream, 2)
+        await stream.drained()
+        failing.fails = False
+    assert failing.kept == [8, 9]
 
 
 def test_a_simulated_tray_hears_each_event_once_across_a_restart_of_the_service() -> None:
