@@ -512,7 +512,9 @@ class Ledger:
     # Events.
 
     def append(self, events: list[dict[str, Any]]) -> None:
-        """Keep these events; the last `EVENTS_KEPT` stay. Raises DatabaseError."""
+        """Keep these events, which come in the order of their numbers; the last
+        `EVENTS_KEPT` stay. One that is kept already may come again. Raises
+        DatabaseError."""
         rows = [
             {
                 "home": self.home, "seq": event["seq"], "run": event.get("run"),
@@ -523,8 +525,13 @@ class Ledger:
         if not rows:
             return
         event = tables.event
+        there = select(event.c.seq, event.c.event).where(
+            event.c.home == self.home, event.c.seq.between(rows[0]["seq"], rows[-1]["seq"])
+        )
         with self.writing() as db:
-            db.execute(insert(event), rows)
+            kept = {(row.seq, row.event) for row in db.execute(there)}
+            if new := [row for row in rows if (row["seq"], row["event"]) not in kept]:
+                db.execute(insert(event), new)
             db.execute(delete(event).where(event.c.home == self.home, event.c.seq <= rows[-1]["seq"] - EVENTS_KEPT))
 
     def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]:

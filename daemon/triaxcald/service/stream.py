@@ -34,7 +34,8 @@ class Message:
 class EventStore(Protocol):
     """Where events are kept. All methods block, and raise DaemonError."""
 
-    def append(self, events: list[dict[str, Any]]) -> None: ...
+    def append(self, events: list[dict[str, Any]]) -> None:
+        """The same event may come again: whether it was stored is not always known."""
 
     def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]: ...
 
@@ -125,8 +126,9 @@ class Stream:
                     await self._forward()
                 self._idle.set()
         finally:
-            events = [*self._unstored, *(dict(m.data) for m in self._waiting if m.kind == "event")]
-            if events:
+            waiting = [dict(m.data) for m in self._waiting if m.kind == "event"]
+            last = self._unstored[-1]["seq"] if self._unstored else 0
+            if events := [*self._unstored, *(event for event in waiting if event["seq"] > last)]:
                 with suppress(DaemonError):
                     self._store.append(events)
 

@@ -182,7 +182,7 @@ def test_events_are_numbered_kept_and_dropped(make_station: MakeStation, open_le
     assert ledger.events_after(2, 3) == events[2:5]
     assert ledger.events_of("r") == events[::2]
     with pytest.raises(DatabaseError):
-        ledger.append([events[0]])
+        ledger.append([events[0] | {"text": "another event of that number"}])
     ledger.append([{"seq": EVENTS_KEPT + 5, "event": "stage"}])
     assert [e["seq"] for e in ledger.events_after(0, 100)] == [6, 7, EVENTS_KEPT + 5]
 

@@ -190,6 +190,71 @@ async def test_what_a_failing_database_did_not_take_is_stored_at_the_end(failing
     assert failing.kept == [8, 9]
 
 
+class Forgetful:
+    """A database whose first ``lost`` answers do not arrive, although it has taken the events."""
+
+    def __init__(self, ledger: Ledger, lost: int) -> None:
+        self.ledger, self.lost = ledger, lost
+
+    def append(self, events: list[dict[str, Any]]) -> None:
+        self.ledger.append(events)
+        if self.lost:
+            self.lost -= 1
+            raise DatabaseError("the connection was lost")
+
+    def events_after(self, seq: int, limit: int) -> list[dict[str, Any]]:
+        return self.ledger.events_after(seq, limit)
+
+    def last_seq(self) -> int:
+        return self.ledger.last_seq()
+
+
+async def test_events_whose_answer_was_lost_are_stored_once_and_block_nothing(
+    ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream_module, "RETRY_S", 0.01)
+    async with flowing(Forgetful(ledger, 1)) as stream, aclosing(stream.listen()) as messages:
+        await anext(messages)
+        emit(stream, 2)
+        async with asyncio.timeout(20):
+            told = [(m.kind, m.seq) for m in [await anext(messages) for _ in range(4)]]
+        assert told == [("event", 1), ("event", 2), ("state", 2), ("state", 2)]
+        assert stream.trouble is None
+    assert [e["seq"] for e in ledger.events_after(0, 10)] == [1, 2]
+
+
+class Slow(Forgetful):
+    """A database that is asked while the service ends; what it is asked first fails."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        super().__init__(ledger, 0)
+        self.asked, self.go_on = threading.Event(), threading.Event()
+
+    def append(self, events: list[dict[str, Any]]) -> None:
+        if not self.asked.is_set():
+            self.asked.set()
+            self.go_on.wait(20)
+            raise DatabaseError("the connection was lost")
+        super().append(events)
+
+
+async def test_an_end_while_events_are_being_stored_loses_none(ledger: Ledger) -> None:
+    store = Slow(ledger)
+    async with flowing(store) as stream:
+        emit(stream, 3)
+        await asyncio.to_thread(store.asked.wait, 20)
+    store.go_on.set()
+    assert [e["seq"] for e in ledger.events_after(0, 10)] == [1, 2, 3]
+
+
+def test_another_event_does_not_take_the_number_of_one_that_is_kept(ledger: Ledger) -> None:
+    ledger.append([{"seq": 1, "event": "stage"}])
+    ledger.append([{"seq": 1, "event": "stage"}, {"seq": 2, "event": "stage"}])
+    with pytest.raises(DatabaseError):
+        ledger.append([{"seq": 2, "event": "poses"}, {"seq": 3, "event": "poses"}])
+    assert [e["seq"] for e in ledger.events_after(0, 10)] == [1, 2]
+
+
 def test_a_simulated_tray_hears_each_event_once_across_a_restart_of_the_service() -> None:
     """Bytes of server-sent events as the service sends them; the second connection asks for what it missed."""
     asked: list[str] = []
