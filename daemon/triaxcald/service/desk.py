@@ -3,7 +3,8 @@ and what the events say. No clock, no file, no bus."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
@@ -102,10 +103,20 @@ class Desk:
         self.chosen: str | None = None
         self.starts: dict[str, dict[str, Any]] = {}
         """Answers to requests to start, by their id."""
+        self._starting = False
 
     @property
     def running(self) -> bool:
         return any(slot.at_work for slot in self.slots.values())
+
+    @contextmanager
+    def starting(self) -> Iterator[None]:
+        """While a start is looked into, the tray that is `due` stays as it is."""
+        self._starting = True
+        try:
+            yield
+        finally:
+            self._starting = False
 
     def document(self, seq: int) -> dict[str, Any]:
         """The `triaxcal.station_state/1`, after the event ``seq``."""
@@ -302,7 +313,7 @@ class Desk:
     # Checks.
 
     def _require_idle(self) -> None:
-        if self.running:
+        if self.running or self._starting:
             raise ApiError(Problem.RUNNING, "a tray is running; wait for its end, or stop it first")
 
     def _slot(self, name: str) -> Slot:

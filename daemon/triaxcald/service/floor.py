@@ -190,13 +190,14 @@ class Floor:
                 return self.desk.starts[request]
             if self.desk.running or self._task is not None:
                 raise ApiError(Problem.RUNNING, "a tray is running")
-            if self._stopping:
-                raise ApiError(Problem.RUNNING, "the service is about to end")
             due = self.desk.due()
             if (trouble := self._trouble) is not None:
                 raise ApiError(Problem(trouble), _BLOCKED[Problem(trouble)])
-            await self._require_golden(due)
-            tray = await self._made(due)
+            with self.desk.starting():
+                await self._require_golden(due)
+                tray = await self._made(due)
+            if self._stopping:
+                raise ApiError(Problem.RUNNING, "the service is about to end")
             runs = {slot: unit.run for slot, unit in tray.units.items()}
             answer = {"tray": tray.id, "runs": runs}
             self.desk.started(tray.id, runs, due, now())
@@ -254,6 +255,12 @@ class Floor:
         for timer in (self._due_timer, self._retry):
             if timer is not None:
                 timer.cancel()
+        # A start that is under way ends first.
+        starting = asyncio.ensure_future(self._starting.acquire())
+        while not starting.done():
+            with suppress(asyncio.CancelledError):
+                await asyncio.wait([starting])
+        self._starting.release()
         if (task := self._task) is not None:
             for slot in self.desk.slots:
                 self._stop(slot, "the service was stopped")
@@ -400,21 +407,33 @@ class Floor:
                 self._later(e)
 
     async def _reloaded(self) -> None:
-        self._again = False
-        try:
-            station = await asyncio.to_thread(self._load)
-            station.require_units()
-            await asyncio.to_thread(golden_calibration, station)
-        except Exception as e:  # noqa: BLE001 - the old station file stays in use
-            self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
-            return
-        kept = self.desk.kept()
-        self.station, self.desk = station, _desk_of(station)
-        self.desk.restore(kept, now())
-        self._loaded(station)
+        async with self._starting:
+            if self._task is not None:  # a tray came first: after it
+                return
+            self._again = False
+            try:
+                station = await asyncio.to_thread(self._load)
+                self._require_same_place(station)
+                await asyncio.to_thread(golden_calibration, station)
+            except Exception as e:  # noqa: BLE001 - the old station file stays in use
+                self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
+                return
+            kept = self.desk.kept()
+            self.station, self.desk = station, _desk_of(station)
+            self.desk.restore(kept, now())
+            self._loaded(station)
         self._log(f"{station.path}: loaded again")
         await self._enter()  # its golden unit may be another
         await self._changed()
+
+    def _require_same_place(self, station: Station) -> None:
+        """Raises InputError where the runs of a station that was read again would not
+        come where the database looks for them, and where it has no units."""
+        station.require_units()
+        if station.folder != self.station.folder:
+            raise InputError(f"{station.path}: folder changes with a restart of the service")
+        if station.file.name != self.station.file.name:
+            raise InputError(f"{station.path}: name changes with a restart of the service")
 
 
 def _desk_of(station: Station) -> Desk:

@@ -1,19 +1,23 @@
-"""The floor while its database fails: runs enter it and the desk is kept as soon as it answers again."""
+"""The floor while its database fails, and what comes in the middle of something else: a station file that is read
+again, an end of the service, a scan."""
 
 from __future__ import annotations
 
 import asyncio
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.daemon.service.conftest import put_outcome
 from triaxcald.service import database as database_module
 from triaxcald.service import floor as floor_module
+from triaxcald.service.errors import ApiError, Problem
 from triaxcald.service.floor import DESK, Floor
 from triaxcald.service.ledger import Ledger, RunFilter
 from triaxcald.service.stream import Stream
@@ -55,3 +59,150 @@ async def test_a_locked_database_gets_the_runs_and_the_desk_once_it_is_free(
     finally:
         await floor.end()
         ledger.close()
+
+
+# Two things at once, at a station whose units are absent.
+
+
+class Gate:
+    """Holds a thread that passes it until it is opened."""
+
+    def __init__(self) -> None:
+        self.reached, self.opened = threading.Event(), threading.Event()
+
+    def __call__(self) -> None:
+        self.reached.set()
+        assert self.opened.wait(20)
+
+
+@asynccontextmanager
+async def at_work(
+    station: Station, load: Callable[[], Station] | None = None
+) -> AsyncIterator[tuple[Floor, list[str]]]:
+    ledger = Ledger.open(station)
+    lines: list[str] = []
+    floor = Floor(station, ledger, partial(Stream, ledger), load=load or (lambda: station), log=lines.append)
+    streaming = asyncio.ensure_future(floor.stream.run())
+    try:
+        await floor.begin()
+        async with asyncio.timeout(60):
+            yield floor, lines
+    finally:
+        await floor.end()
+        await floor.stream.drained()
+        streaming.cancel()
+        ledger.close()
+
+
+async def over(floor: Floor) -> None:
+    """The end of the tray."""
+    if floor._task is not None:
+        await floor._task
+
+
+@pytest.fixture
+def works(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    """The rules are held that a start asks in a thread."""
+    gate, ask = Gate(), floor_module.works
+
+    def held(*arguments: Any) -> Any:
+        gate()
+        return ask(*arguments)
+
+    monkeypatch.setattr(floor_module, "works", held)
+    return gate
+
+
+async def test_a_station_file_that_is_read_while_a_tray_starts_waits_for_its_end(
+    make_station: Callable[..., Station],
+) -> None:
+    load, station = Gate(), make_station()
+
+    def loaded() -> Station:
+        load()
+        return station
+
+    async with at_work(station, loaded) as (floor, lines):
+        reloading = asyncio.ensure_future(floor.reload())
+        await asyncio.to_thread(load.reached.wait, 20)
+        await floor.scan("1001")
+        starting = asyncio.ensure_future(floor.start(None))
+        await asyncio.wait([starting], timeout=0.2)
+        load.opened.set()
+        await reloading
+        await starting
+        assert floor.desk.slots["a"].at_work
+        assert floor.desk.slots["a"].reason is None
+        await floor.reload()
+        assert len(lines) == 1
+        await floor.stop("enough")
+        await over(floor)
+        assert [line.endswith(": loaded again") for line in lines] == [True, True]
+
+
+async def test_a_stop_at_the_very_start_ends_its_slot_with_an_outcome_and_no_other(
+    make_station: Callable[..., Station],
+) -> None:
+    async with at_work(make_station()) as (floor, _):
+        await floor.put({"a": "1001", "b": "1002"}, {})
+        await floor.start(None)
+        await asyncio.sleep(0)  # the tray has begun, and its units not yet
+        assert await floor.stop_slot("a", "a wrong unit") == {"stopped": ["a"]}
+        while floor.desk.slots["a"].at_work:
+            await asyncio.sleep(0.01)
+        assert floor.desk.slots["a"].reason == "stopped: a wrong unit"
+        await floor.stop_slot("b", "enough")
+        await over(floor)
+        assert {slot.code for slot in floor.desk.slots.values()} <= {"stopped", "absent"}
+
+
+@pytest.mark.parametrize("change", ["name", "folder"])
+async def test_a_station_file_of_another_folder_or_name_is_not_taken_without_a_restart(
+    make_station: Callable[..., Station], change: str
+) -> None:
+    station = make_station()
+    async with at_work(station, lambda: make_station(**{change: "elsewhere"})) as (floor, lines):
+        await floor.reload()
+        assert floor.station is station
+    assert f"{change} changes with a restart" in lines[0]
+
+
+async def test_a_scan_while_a_tray_starts_is_refused_and_not_lost(
+    make_station: Callable[..., Station], works: Gate
+) -> None:
+    async with at_work(make_station()) as (floor, _):
+        await floor.scan("1001")
+        starting = asyncio.ensure_future(floor.start(None))
+        await asyncio.to_thread(works.reached.wait, 20)
+        for change in (lambda: floor.scan("1002"), floor.clear, lambda: floor.put({"a": "1003"}, {"order": "9"})):
+            with pytest.raises(ApiError) as caught:
+                await change()
+            assert caught.value.problem is Problem.RUNNING
+        works.opened.set()
+        assert set((await starting)["runs"]) == {"a"}
+        assert floor.desk.slots["a"].serial == "1001"
+
+
+async def test_a_start_that_is_refused_leaves_the_scans(make_station: Callable[..., Station]) -> None:
+    async with at_work(make_station("[rules]\noperator = true\n")) as (floor, _):
+        await floor.scan("1001")
+        with pytest.raises(ApiError):
+            await floor.start(None)
+        assert (await floor.scan("1002"))["slot"] == "b"
+
+
+async def test_no_tray_starts_once_the_service_ends(make_station: Callable[..., Station], works: Gate) -> None:
+    async with at_work(make_station()) as (floor, _):
+        await floor.scan("1001")
+        starting = asyncio.ensure_future(floor.start(None))
+        await asyncio.to_thread(works.reached.wait, 20)
+        ending = asyncio.ensure_future(floor.end())
+        await asyncio.sleep(0)
+        ending.cancel()  # a second signal
+        works.opened.set()
+        await asyncio.wait([ending])
+        with pytest.raises(ApiError) as caught:
+            await starting
+        assert caught.value.message == "the service is about to end"
+        assert floor._task is None
+        assert floor.desk.slots["a"].serial == "1001"
