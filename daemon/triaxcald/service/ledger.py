@@ -646,6 +646,18 @@ class Ledger:
             row = db.execute(query.order_by(out.c.id).limit(1)).first()
         return None if row is None else Waiting(*row)
 
+    def body_of(self, waiting: Waiting) -> str | None:
+        """What was sent, or nearly, when the result was first tried."""
+        query = select(tables.sending.c.body).where(tables.sending.c.id == waiting.id)
+        with self.reading() as db:
+            body: str | None = db.execute(query).scalar()
+        return body
+
+    def keep_body(self, waiting: Waiting, body: str) -> None:
+        """Before the first try: each later one sends the same."""
+        with self.writing() as db:
+            db.execute(insert(tables.sending).values(id=waiting.id, body=body))
+
     def has_delivered(self, receiver: str) -> bool:
         """Whether a result ever reached the receiver."""
         out = tables.outbox
@@ -666,6 +678,8 @@ class Ledger:
         out = tables.outbox
         with self.writing() as db:
             db.execute(update(out).where(out.c.id == waiting.id).values(tries=out.c.tries + 1, **values))
+            if "state" in values:
+                db.execute(delete(tables.sending).where(tables.sending.c.id == waiting.id))
 
     def deliveries(self) -> list[Delivery]:
         """The state of each receiver of the station file."""

@@ -5,6 +5,7 @@ it."""
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import math
 import os
@@ -42,6 +43,11 @@ AGAIN: Final = frozenset((408, 429))
 """With every status from 500 on: the receiver may take it later."""
 ERROR_MOST: Final = 300
 BLOCK: Final = 1 << 20
+NO_FILE: Final = frozenset(
+    (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO)
+)
+"""Errors by which there is no such file. All others may pass: too many files are open,
+or a share is away."""
 RUN: Final = re.compile(r"[0-9A-Za-z][0-9A-Za-z-]{0,63}")
 """Ids of runs, which become names of files."""
 
@@ -213,17 +219,28 @@ class Outbox:
                 partial.unlink(missing_ok=True)
 
     def _result(self, waiting: Waiting) -> bytes:
-        """The `triaxcal.result/1`, from the files of the run: the same bytes each time.
-        Raises Refused where they are gone; DaemonError of the database."""
+        """The `triaxcal.result/1`, from the files of the run as they were at the first
+        try: one key never has two bodies. Raises Refused where they are gone, NotNow
+        where they cannot be read; DaemonError of the database."""
+        if (body := self._ledger.body_of(waiting)) is None:
+            body = self._made(waiting)
+            self._ledger.keep_body(waiting, body)
+        return body.encode()
+
+    def _made(self, waiting: Waiting) -> str:
+        """Raises as `_result`."""
         path = self._ledger.folder / waiting.outcome
         try:
             outcome = parse_document(td.files.read_whole(path, DOCUMENT_MOST), where=str(path))
             recording = outcome.get("recording")
             digest = None if recording is None else _digest(self._ledger.folder / Path(recording).name)
-        except (OSError, td.files.TooLarge, InputError) as e:
-            raise Refused(f"{path}: cannot be read: {getattr(e, 'strerror', None) or e}") from e
+        except (OSError, td.files.TooLarge, InputError, ValueError) as e:
+            why = f"{path}: cannot be read: {getattr(e, 'strerror', None) or e}"
+            if isinstance(e, OSError) and e.errno not in NO_FILE:
+                raise NotNow(why) from e
+            raise Refused(why) from e
         figures = self._ledger.measurements_of(waiting.run)
-        return to_text(result_of(outcome, figures, digest)).encode()
+        return to_text(result_of(outcome, figures, digest))
 
 
 def result_of(

@@ -187,6 +187,13 @@ Index(
 )  # fmt: skip
 Index("outbox_waiting", outbox.c.home, outbox.c.receiver, outbox.c.state, outbox.c.id)
 
+sending: Final = Table(
+    "sending", metadata,
+    Column("id", BigInteger, primary_key=True, autoincrement=False),
+    Column("body", Text, nullable=False),
+)  # fmt: skip
+"""The ``body`` with which a row of `outbox` that waits was first tried."""
+
 event: Final = Table(
     "event", metadata,
     Column("home", Text, nullable=False),

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 
 from tests.daemon.service.conftest import put_outcome
 from tests.daemon.service.receivers import Answer, HttpReceiver
 from triaxcald.documents import to_text
 from triaxcald.schema.codes import Code
 from triaxcald.schema.result import Result
-from triaxcald.service import outbox
+from triaxcald.service import outbox, tables
 from triaxcald.service.ledger import Delivery, Ledger
 from triaxcald.service.outbox import Outbox
 from triaxcald.station.config import Station
@@ -356,6 +357,69 @@ async def test_a_run_that_cannot_be_told_is_set_aside_and_the_next_one_goes_on(b
     assert len(said) == 4
     assert not list(tmp_path.parent.glob("escaped*"))
     assert {p.name for p in (tmp_path / "out").iterdir()} == {f"{documents[n]['run']}.json" for n in (2, 3, 5)}
+
+
+async def test_a_result_that_is_tried_again_is_the_same_whatever_happens_to_its_files(
+    make_station: MakeStation, open_ledger: Callable[[Station], Ledger], tmp_path: Path
+) -> None:
+    with HttpReceiver(503).listening() as receiver:
+        station = make_station(by_post(receiver))
+        ledger = open_ledger(station)
+        ledger.begin_deliveries()
+        document = put_outcome(tmp_path, 2) | {"recording": "a.mcap"}
+        (path,) = tmp_path.glob("*.outcome.json")
+        path.write_text(to_text(document))
+        (tmp_path / "a.mcap").write_bytes(b"readings")
+        ledger.take()
+        async with delivering(station, ledger, first_s=60) as (out, _):
+            await asyncio.to_thread(receiver.wait, 1)
+            while not (await asyncio.to_thread(out.status))[0].error:
+                await asyncio.sleep(0.01)
+        (tmp_path / "a.mcap").rename(tmp_path / "archived.mcap")
+        path.write_text(to_text(document | {"reason": "told in another way"}))
+        ledger.take()
+        async with delivering(station, ledger) as (out, _):
+            await settled(out, 0)
+    first, second = receiver.got
+    assert first.document["recording_sha256"] == hashlib.sha256(b"readings").hexdigest()
+    assert first.data == second.data
+    with ledger.reading() as db:
+        assert db.execute(select(tables.sending)).all() == []
+
+
+@pytest.mark.parametrize("recording", ["a\0b.mcap", "..", "loop", "a" * 300])
+async def test_a_recording_that_can_be_none_holds_up_no_other_result(
+    began: Any, tmp_path: Path, recording: str
+) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with HttpReceiver().listening() as receiver:
+        station, ledger = began(by_post(receiver))
+        document = put_outcome(tmp_path, 1) | {"recording": recording}
+        next(tmp_path.glob("*.outcome.json")).write_text(to_text(document))
+        second = put_outcome(tmp_path, 2)
+        ledger.take()
+        async with delivering(station, ledger) as (out, _):
+            await settled(out, 0)
+    assert receiver.got[-1].run == second["run"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="no file that cannot be read")
+async def test_a_result_whose_files_cannot_be_read_for_a_while_is_waited_for(began: Any, tmp_path: Path) -> None:
+    with HttpReceiver().listening() as receiver:
+        station, ledger = began(by_post(receiver))
+        document = put_outcome(tmp_path, 1)
+        (path,) = tmp_path.glob("*.outcome.json")
+        ledger.take()
+        there = path.read_bytes()
+        path.unlink()
+        path.symlink_to("/proc/self/mem")  # can be opened, and not be read
+        async with delivering(station, ledger) as (out, _):
+            while not (await asyncio.to_thread(out.status))[0].error:
+                await asyncio.sleep(0.01)
+            path.unlink()
+            path.write_bytes(there)
+            (state,) = await settled(out, 0)
+    assert (state.refused, [g.run for g in receiver.got]) == (0, [document["run"]])
 
 
 # Files.
