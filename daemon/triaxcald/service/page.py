@@ -172,6 +172,8 @@ def page_router(service: Service) -> APIRouter:
     """The pages, their files, and the thinned readings of a recording as a picture
     needs them. Pages are for readers: whoever is none is led to the sign-in."""
     router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+    drawing = asyncio.Semaphore(1)
+    """One recording at a time leaves memory and threads to the tray."""
 
     async def shown(request: Request, name: str, **given: Any) -> Response:
         try:
@@ -204,7 +206,8 @@ def page_router(service: Service) -> APIRouter:
         name = None if row is None else row.get("recording")
         if name is None:
             raise ApiError(Problem.UNKNOWN, f"run {run} has no recording")
-        return JSONResponse(await asyncio.to_thread(trace_of, service.station.folder / Path(name).name))
+        async with drawing:
+            return JSONResponse(await asyncio.to_thread(trace_of, service.station.folder / Path(name).name))
 
     @router.get("/units/{serial:path}")
     async def unit(request: Request, serial: str) -> Response:
