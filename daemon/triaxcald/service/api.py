@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.exceptions import HTTPException
 
+from triaxcald.errors import DaemonError
 from triaxcald.schema.station_state import StationState
 from triaxcald.service.desk import WORK
 from triaxcald.service.errors import ApiError, Problem
@@ -229,6 +230,11 @@ def answer_errors(app: FastAPI) -> None:
         problem = Problem.UNKNOWN if e.status_code == 404 else Problem.INVALID
         return JSONResponse({"code": problem.value, "message": str(e.detail)}, e.status_code, headers=e.headers)
 
+    async def database(_: Request, e: Exception) -> JSONResponse:
+        error = ApiError(Problem.DATABASE, str(e))
+        return JSONResponse(error.body, error.problem.status)
+
     app.add_exception_handler(ApiError, ours)
+    app.add_exception_handler(DaemonError, database)
     app.add_exception_handler(RequestValidationError, invalid)
     app.add_exception_handler(HTTPException, framework)

@@ -42,6 +42,7 @@ class ApiError(Exception):
     with the answer."""
 
     def __init__(self, problem: Problem, message: str, headers: dict[str, str] | None = None) -> None:
+        message = message.encode("utf-8", "replace").decode()  # JSON can name half of a surrogate pair
         super().__init__(message)
         self.problem, self.message, self.headers = problem, message, headers or {}
 
