@@ -55,7 +55,7 @@ class Book(Protocol):
 
     def put_setting(self, key: str, value: Any) -> None: ...
 
-    def golden(self, serial: str, slots: Sequence[str]) -> dict[str, golden.LastCheck]: ...
+    def golden(self, serial: str, slots: Sequence[str], until_us: int) -> dict[str, golden.LastCheck]: ...
 
 
 def _now_us() -> int:
@@ -365,8 +365,10 @@ class Floor:
         async with self._entering:
             await asyncio.to_thread(self._book.take)
             rule, before = self.station.file.rules.golden, self._checks
-            slots = list(self.desk.slots)
-            self._checks = {} if rule is None else await asyncio.to_thread(self._book.golden, rule.serial, slots)
+            slots, until_us = list(self.desk.slots), _now_us() + golden.CLOCK_STEP_US
+            self._checks = (
+                {} if rule is None else await asyncio.to_thread(self._book.golden, rule.serial, slots, until_us)
+            )
         self._told.clear()
         self._recorded()
         self._await_due()

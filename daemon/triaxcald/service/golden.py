@@ -12,6 +12,8 @@ from triaxcald.service.errors import Problem
 from triaxcald.station.config import Rules
 
 HOUR_US: Final = 3_600_000_000
+CLOCK_STEP_US: Final = 60_000_000
+"""By how much a clock may be set back without a doubt in what it said before."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,9 @@ def is_check(row: Mapping[str, Any]) -> bool:
 
 
 def problem_of(last: LastCheck | None, now_us: int, every_h: float) -> Problem | None:
-    """Why a slot may not run. A verification that a clock set back has put into the
-    future counts as just done."""
-    if last is None:
+    """Why a slot may not run. A verification in the future, where a clock that was
+    wrong has put it, says nothing of the present."""
+    if last is None or (last.passed and last.ended_us > now_us + CLOCK_STEP_US):
         return Problem.GOLDEN_DUE
     if not last.passed:
         return Problem.GOLDEN_FAILED

@@ -427,9 +427,10 @@ class Ledger:
         """All runs of a unit, in the order of time."""
         return self.every(RunFilter(serial=serial))
 
-    def golden(self, serial: str, slots: Sequence[str]) -> dict[str, LastCheck]:
+    def golden(self, serial: str, slots: Sequence[str], until_us: int) -> dict[str, LastCheck]:
         """The last verification of the golden unit ``serial`` in each of these slots,
-        as far as there is one. Runs without a verdict and calibrations are none."""
+        as far as there is one. Runs without a verdict and calibrations are none, nor is
+        one that passed after ``until_us``, by a clock that was wrong."""
         run, filed = self.run, tables.filed
         of_unit = select(filed.c.outcome).where(filed.c.home == self.home, filed.c.plain_serial == plain_serial(serial))
         query = self._here(select(run.c.ended_us, run.c.verdict)).where(
@@ -437,6 +438,7 @@ class Ledger:
             run.c.verdict.in_([Verdict.PASS.value, Verdict.FAIL.value]),
             run.c.verification_rms_g.is_not(None),
             run.c.rms_g.is_(None),
+            or_(run.c.ended_us <= until_us, run.c.verdict == Verdict.FAIL.value),
         )
         query = query.order_by(run.c.ended_us.desc(), run.c.outcome.desc()).limit(1)
         found = {}

@@ -42,7 +42,9 @@ NOW_US = 1_900_000_000_000_000
         (LastCheck(NOW_US - 8 * HOUR_US - 1, True), DUE),
         (LastCheck(NOW_US, False), FAILED),
         (LastCheck(NOW_US - 9 * HOUR_US, False), FAILED),
-        (LastCheck(NOW_US + HOUR_US, True), None),  # a clock was set back
+        (LastCheck(NOW_US + 1_000_000, True), None),  # a clock was set back by a step
+        (LastCheck(NOW_US + HOUR_US, True), DUE),  # a clock was wrong
+        (LastCheck(NOW_US + HOUR_US, False), FAILED),
     ],
 )
 def test_a_slot_runs_as_long_as_its_golden_unit_has_verified_lately(
@@ -104,11 +106,26 @@ def test_the_last_verification_of_each_slot_is_in_the_folder(
     put(tmp_path, 5, "a", serial="1")
     passed = put(tmp_path, 6, "b", serial="815")
     ledger.take()
-    assert ledger.golden("0815", ["a", "b", "c"]) == {"a": LastCheck(failed, False), "b": LastCheck(passed, True)}
-    assert ledger.golden("0815", ["c"]) == ledger.golden("9", ["a"]) == {}
+    found = ledger.golden("0815", ["a", "b", "c"], NOW_US)
+    assert found == {"a": LastCheck(failed, False), "b": LastCheck(passed, True)}
+    assert ledger.golden("0815", ["c"], NOW_US) == ledger.golden("9", ["a"], NOW_US) == {}
     later = put(tmp_path, 7, "a")
     ledger.take()
-    assert ledger.golden("0815", ["a"]) == {"a": LastCheck(later, True)}
+    assert ledger.golden("0815", ["a"], NOW_US) == {"a": LastCheck(later, True)}
+
+
+def test_a_verification_by_a_clock_that_was_ahead_opens_nothing_and_is_no_hindrance(
+    make_station: Callable[..., Station], open_ledger: Callable[[Station], Ledger], tmp_path: Path
+) -> None:
+    ledger = open_ledger(make_station())
+    put(tmp_path, 1_000_000, "a")
+    put(tmp_path, 1_000_000, "b")
+    now_us = put(tmp_path, 7, "b")  # verified again, by the right clock
+    failed = put(tmp_path, 1_000_000, "c", Code.VERIFICATION_OUTSIDE)
+    put(tmp_path, 7, "c")
+    ledger.take()
+    found = ledger.golden("0815", ["a", "b", "c"], now_us)
+    assert found == {"b": LastCheck(now_us, True), "c": LastCheck(failed, False)}  # to be safe
 
 
 def test_verifications_of_the_golden_unit_are_no_units_of_the_yield(
