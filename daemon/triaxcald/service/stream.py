@@ -24,7 +24,8 @@ RETRY_S: Final = 2.0
 
 @dataclass(frozen=True)
 class Message:
-    """``kind`` is `state`, `event` or `live`; ``seq`` is None of what has no number."""
+    """``kind`` is `state`, `event` or `live`. ``seq`` is the number with which a
+    listener that has this message comes again, None of what has no number."""
 
     kind: str
     data: Mapping[str, Any]
@@ -165,13 +166,15 @@ class Stream:
             # Listening begins here: what is not yet sent will come by itself.
             seq = self.seq
             sent = next((m.seq - 1 for m in self._waiting if m.kind == "event" and m.seq is not None), seq)
-            yield Message("state", self._state(seq), seq)
+            known = after if after is not None and 0 <= seq - after <= self._kept else None
+            # A connection that breaks now is made again behind this number.
+            yield Message("state", self._state(seq), seq if known is None else known)
             had = seq
-            if after is not None and 0 <= seq - after <= self._kept:
-                for event in await self._missed(after):
+            if known is not None:
+                for event in await self._missed(known):
                     if event["seq"] <= sent:
                         yield Message("event", event, event["seq"])
-                had = max(sent, after)
+                had = max(sent, known)
             while True:
                 while listener.messages:
                     message = listener.messages.popleft()
