@@ -145,12 +145,12 @@ class Store:
             return self._database.on(work)
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each outcome in the folder, by its name. Raises OSError where the
-        folder cannot be read."""
+        """SHA-256 of each outcome in the folder, by its name, in the order of their
+        ends. Raises OSError where the folder cannot be read."""
 
         def work(db: sqlite3.Connection) -> dict[str, str]:
             self._refresh(db)
-            return dict(db.execute("SELECT outcome, outcome_sha256 FROM run"))
+            return dict(db.execute("SELECT outcome, outcome_sha256 FROM run ORDER BY ended_us, outcome"))
 
         with self._lock:
             return self._database.on(work)

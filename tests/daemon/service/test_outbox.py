@@ -23,6 +23,7 @@ from tests.daemon.service.receivers import Answer, HttpReceiver
 from triaxcald.documents import to_text
 from triaxcald.schema.codes import Code
 from triaxcald.schema.result import Result
+from triaxcald.service import ledger as ledger_module
 from triaxcald.service import outbox, tables
 from triaxcald.service.ledger import Delivery, Ledger
 from triaxcald.service.outbox import Outbox
@@ -420,6 +421,19 @@ async def test_a_result_whose_files_cannot_be_read_for_a_while_is_waited_for(beg
             path.write_bytes(there)
             (state,) = await settled(out, 0)
     assert (state.refused, [g.run for g in receiver.got]) == (0, [document["run"]])
+
+
+async def test_results_of_several_transactions_come_in_the_order_of_their_ends_too(
+    began: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ledger_module, "BATCH", 2)
+    with HttpReceiver().listening() as receiver:
+        station, ledger = began(by_post(receiver))
+        ended = [put_outcome(tmp_path, n, slot="ab"[n in (2, 5)]) for n in range(1, 7)]
+        ledger.take()
+        async with delivering(station, ledger) as (out, _):
+            await settled(out, 0)
+    assert [g.run for g in receiver.got] == [document["run"] for document in ended]
 
 
 # Files.
