@@ -199,14 +199,18 @@ class Floor:
             if self._stopping:
                 raise ApiError(Problem.RUNNING, "the service is about to end")
             runs = {slot: unit.run for slot, unit in tray.units.items()}
-            answer = {"tray": tray.id, "runs": runs}
+            answer, before = {"tray": tray.id, "runs": runs}, self.desk.kept()
             self.desk.started(tray.id, runs, due, now())
             if request is not None:
                 self.desk.remember_start(request, answer)
             # On the disk before any device is touched: a repetition after a restart of
             # the service must not start again.
-            await self._changed()
-            self._tray = tray
+            self._tray = tray  # which can be stopped from now on
+            if not await self._save():
+                self._tray = None
+                self.desk.restore(before, now())
+                raise ApiError(Problem.DATABASE, _BLOCKED[Problem.DATABASE])
+            self.stream.changed()
             self._task = asyncio.ensure_future(self._run(tray))
             return answer
 
@@ -396,17 +400,20 @@ class Floor:
         self.stream.changed()
         await self._save()
 
-    async def _save(self) -> None:
-        """Keep the desk for a restart, later if the database fails."""
+    async def _save(self) -> bool:
+        """Keep the desk for a restart, later if the database fails. Gives whether it is
+        kept now."""
         async with self._saving:  # an earlier state never replaces a later one
             kept = self.desk.kept()
             if kept == self._saved:
-                return
+                return True
             try:
                 await asyncio.to_thread(self._book.put_setting, DESK, kept)
                 self._saved = kept
             except DaemonError as e:
                 self._later(e)
+                return False
+        return True
 
     async def _reloaded(self) -> None:
         async with self._starting:
@@ -450,12 +457,12 @@ _TOLD: Final = {
 }
 _BLOCKED: Final = {
     Problem.DISK: "the disk is full; free some space in the station's folder",
-    Problem.DATABASE: "the database does not take the events; see the log of the service",
+    Problem.DATABASE: "the database takes nothing; see the log of the service",
 }
-_tasks: set[asyncio.Future[None]] = set()
+_tasks: set[asyncio.Future[Any]] = set()
 
 
-def _keep_alive(task: asyncio.Future[None]) -> None:
+def _keep_alive(task: asyncio.Future[Any]) -> None:
     """The loop has only weak references to its tasks."""
     _tasks.add(task)
     task.add_done_callback(_tasks.discard)

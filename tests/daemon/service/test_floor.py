@@ -61,6 +61,28 @@ async def test_a_locked_database_gets_the_runs_and_the_desk_once_it_is_free(
         ledger.close()
 
 
+async def test_a_start_that_a_restart_would_not_know_touches_no_device(
+    make_station: Callable[..., Station], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the same request would start again after a kill."""
+    monkeypatch.setattr(database_module, "BUSY_S", 0.05)
+    request = "01890000-0000-7000-8000-000000000000"
+    async with at_work(make_station()) as (floor, lines):
+        await floor.scan("1001")
+        with closing(sqlite3.connect(tmp_path / FILE_NAME, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            with pytest.raises(ApiError) as caught:
+                await floor.start(request)
+            assert caught.value.problem is Problem.DATABASE
+            assert lines  # why
+            other.execute("ROLLBACK")
+        slot = floor.state(0)["slots"][0]
+        assert (slot["state"], slot["serial"]) == ("scanned", "1001")
+        answer = await floor.start(request)
+        assert await floor.start(request) == answer
+        assert floor.desk.slots["a"].run == answer["runs"]["a"]
+
+
 # Two things at once, at a station whose units are absent.
 
 
@@ -154,6 +176,19 @@ async def test_a_stop_at_the_very_start_ends_its_slot_with_an_outcome_and_no_oth
         await floor.stop_slot("b", "enough")
         await over(floor)
         assert {slot.code for slot in floor.desk.slots.values()} <= {"stopped", "absent"}
+
+
+async def test_a_stop_while_the_start_is_noted_stops_the_tray(make_station: Callable[..., Station]) -> None:
+    async with at_work(make_station()) as (floor, _):
+        await floor.scan("1001")
+        async with floor._saving:  # as a slow database does
+            starting = asyncio.ensure_future(floor.start(None))
+            while not floor.desk.running:
+                await asyncio.sleep(0)
+            assert await floor.stop("not yet") == {"stopped": ["a"]}
+        await starting
+        await over(floor)
+        assert floor.desk.slots["a"].reason == "stopped: not yet"
 
 
 @pytest.mark.parametrize("change", ["name", "folder"])
