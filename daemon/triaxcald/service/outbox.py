@@ -10,7 +10,9 @@ import hashlib
 import math
 import os
 import re
+import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -81,6 +83,8 @@ class Outbox:
         self._ledger, self._station, self._log, self._first_s = ledger, station, log, first_s
         self._news: dict[str, asyncio.Event] = {}
         self._changed = asyncio.Event()
+        self._putting: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        """By receiver: a thread goes on although its delivery is cancelled."""
 
     def news(self) -> None:
         """Results may wait."""
@@ -194,6 +198,11 @@ class Outbox:
         """As a file that appears complete, and never in place of another. A folder is
         made before the first result alone: later it may be a share that is away. Raises
         NotNow, Refused; DaemonError of the database."""
+        with self._putting[receiver.name]:
+            self._put_alone(receiver, run, data)
+
+    def _put_alone(self, receiver: Receiver, run: str, data: bytes) -> None:
+        """Raises as `_put`."""
         assert receiver.folder is not None
         folder = self._station.path.parent / receiver.folder
         path, partial = folder / f"{run}.json", folder / f".{run}.json.part"

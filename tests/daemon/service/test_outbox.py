@@ -475,6 +475,31 @@ async def test_the_same_file_is_delivered(began: Any, tmp_path: Path) -> None:
     assert (state.refused, path.stat()) == (0, before)
 
 
+async def test_a_station_file_that_is_read_again_while_a_file_is_written_shows_no_part_of_it(
+    began: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread of the cancelled delivery goes on beside the one that delivers again."""
+    held, again, go_on = threading.Event(), threading.Event(), threading.Event()
+    appear = outbox._appear
+
+    def appearing(partial: Path, path: Path) -> None:
+        (again if held.is_set() else held).set()
+        assert go_on.wait(20)
+        appear(partial, path)
+
+    monkeypatch.setattr(outbox, "_appear", appearing)
+    station, ledger = began(FILES)
+    put_outcome(tmp_path, 1)
+    ledger.take()
+    async with delivering(station, ledger) as (out, said):
+        await asyncio.to_thread(held.wait, 20)
+        out.receive(station)
+        assert not await asyncio.to_thread(again.wait, 0.5)
+        go_on.set()
+        (state,) = await settled(out, 0)
+    assert (state.refused, said) == (0, [])
+
+
 async def test_a_folder_that_goes_away_is_waited_for(began: Any, tmp_path: Path) -> None:
     station, ledger = began(FILES)
     folder = tmp_path / "out"
