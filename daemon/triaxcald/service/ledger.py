@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from sqlalchemy import Connection, Engine, Select, Table, and_, delete, func, insert, inspect, or_, select, update
+from sqlalchemy.exc import SQLAlchemyError
 
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, StationError
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
@@ -60,6 +61,10 @@ LOOK_MOST: Final = 200
 """Runs whose files are looked for one by one."""
 LOCK: Final = 74112
 """Of a PostgreSQL server, with the name of the station: who takes its runs."""
+SERVICE_LOCK: Final = LOCK + 1
+"""The same: which service works for it."""
+KEEPALIVE: Final = {"tcp_keepalives_idle": 10, "tcp_keepalives_interval": 5, "tcp_keepalives_count": 3}
+"""Settings by which a PostgreSQL server finds out within 25 s that a client is gone."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +242,31 @@ class Ledger:
             if not self._sqlite:
                 db.execute(select(func.pg_advisory_xact_lock(LOCK, func.hashtext(self.home))))
             yield db
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other services off the station of this name in a shared database: each
+        would remove the runs of the other, whose folder it does not see. A file has its
+        folder's lock. Raises StationError if there is one, DatabaseError."""
+        if self._sqlite:
+            yield
+            return
+        with answering():
+            db = self.engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        try:
+            with answering():
+                db.detach()  # closed at the end, and the lock with it
+                for name, value in KEEPALIVE.items():  # of a computer that lost its power
+                    db.exec_driver_sql(f"SET {name} = {value}")
+                free = db.execute(select(func.pg_try_advisory_lock(SERVICE_LOCK, func.hashtext(self.home)))).scalar()
+            if not free:
+                raise StationError(
+                    f"--database: another service works for a station named {self.station}; give one another name"
+                )
+            yield
+        finally:
+            with suppress(SQLAlchemyError):
+                db.close()
 
     # Runs.
 

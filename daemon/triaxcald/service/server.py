@@ -93,10 +93,21 @@ async def serve(
             log(f"triaxcal: {ledger.lost}")
         hosts = known_hosts(address.host, listening.getsockname()[1], secure=address.secure)
         try:
-            async with _working(station, ledger, address, hosts, log) as service:
+            async with _only_one(ledger), _working(station, ledger, address, hosts, log) as service:
                 await _serve(service, address, listening, reload, ready)
         finally:
             await asyncio.to_thread(ledger.close)
+
+
+@asynccontextmanager
+async def _only_one(ledger: Ledger) -> AsyncIterator[None]:
+    """As `Ledger.alone`, which blocks."""
+    alone = ledger.alone()
+    await asyncio.to_thread(alone.__enter__)
+    try:
+        yield
+    finally:
+        await asyncio.to_thread(alone.__exit__, None, None, None)
 
 
 @asynccontextmanager

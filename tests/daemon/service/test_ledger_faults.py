@@ -19,7 +19,7 @@ import pytest
 from sqlalchemy import insert, select
 
 from tests.daemon.service.conftest import put_outcome
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, StationError
 from triaxcald.service import tables
 from triaxcald.service.database import DatabaseError
 from triaxcald.service.ledger import Ledger, RunFilter
@@ -405,3 +405,18 @@ def test_two_services_that_take_one_folder_agree(
     assert failed == []
     assert sorted(row["run"] for row in ledgers[0].every(RunFilter())) == sorted(made)
     assert sorted(row["run"] for row in rows(ledgers[0], tables.outbox)) == sorted(made)
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_two_services_do_not_work_for_one_station_in_a_shared_database(
+    make_station: MakeStation, open_ledger: Callable[[Station], Ledger]
+) -> None:
+    first, second, other = open_ledger(make_station()), open_ledger(make_station()), open_ledger(make_station(name="b"))
+    with first.alone(), other.alone():
+        with pytest.raises(StationError, match="another service works for a station named line 1"), second.alone():
+            pass
+        with first.reading() as db:
+            db.execute(select(tables.setting)).all()
+        first.take()
+    with second.alone():
+        pass
