@@ -139,6 +139,7 @@ class UnitRun(UnitSession):
         self._attempt = Attempt(self.id, iso_time(clock_ns()), work or Work(self.name, place.unit.serial))
         self._attempt_file: AttemptFile | None = None
         self._history = History()
+        self._at_work = False
         self._answered = False
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
@@ -157,6 +158,7 @@ class UnitRun(UnitSession):
     async def run(self) -> Outcome:
         """Run the line. Raises nothing, not even when cancelled: the outcome has every
         error."""
+        self._at_work = True
         if self._attempts is not None:
             return await self._run(self._attempts)
         tray = _attempts_at(self.station, self.id)
@@ -234,10 +236,12 @@ class UnitRun(UnitSession):
         if self.stopped_for is not None:  # before it began
             raise asyncio.CancelledError
 
-    def stop(self, reason: str) -> None:
-        """Note the reason of a stop, which a cancellation of `run` has to follow if the
-        run has begun."""
+    def stop(self, reason: str) -> bool:
+        """Note the reason of a stop. Returns whether a cancellation of `run` has to
+        follow: a run that has not begun stops by itself, and a task that is cancelled
+        before its first step would leave no outcome."""
         self.stopped_for = reason
+        return self._at_work
 
     def _aborted(self, e: BaseException) -> Ending:
         ending = aborted(e, self._provisioning)
@@ -649,8 +653,7 @@ class UnitHandle:
 
     def stop(self, reason: str) -> None:
         """Stop this unit alone: it first puts its device in order. The others go on."""
-        self._unit.stop(reason)
-        if self._task is not None:
+        if self._unit.stop(reason) and self._task is not None:
             self._task.cancel()
 
     @property

@@ -211,6 +211,26 @@ def test_a_unit_that_is_stopped_before_the_start_gets_its_outcome(bench: Path) -
     assert list(bench.parent.glob(f"{FOLDER}/*")) == []
 
 
+def test_a_unit_that_is_stopped_as_its_tray_starts_gets_its_outcome(workshop: Any) -> None:
+    """Between the start of the tray and the first step of the unit."""
+    bus = {"host": "127.0.0.1", "port": 1}
+    station = workshop.station({"name": "left", "bus": bus}, {"name": "right", "bus": {**bus, "unit_id": 2}}, plan=PLAN)
+    ended: list[str] = []
+
+    async def work() -> list[Outcome]:
+        tray = TrayRun(load_station(station), Quiet(), ended=lambda o: ended.append(o.unit))
+        started = asyncio.ensure_future(tray)
+        asyncio.get_running_loop().call_soon(tray.units["left"].stop, "wrong label")
+        async with asyncio.timeout(60):
+            return await started
+
+    left, right = asyncio.run(work())
+    assert (left.document["code"], left.document["reason"]) == ("stopped", "stopped: wrong label")
+    assert left.outcome is not None
+    assert right.document["code"] == "absent"
+    assert sorted(ended) == ["left", "right"]
+
+
 # Killed runs. The recording is cut off at any byte, as a killed process leaves it.
 
 
