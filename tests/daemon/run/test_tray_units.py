@@ -182,8 +182,11 @@ def test_a_vanished_reader_of_the_events_stops_nothing() -> None:
             events.stage("u", Stage.POSES)
 
 
-def test_a_reader_that_does_not_read_holds_up_no_event() -> None:
+@pytest.mark.parametrize("blocking", [True, False])
+def test_a_reader_that_does_not_read_holds_up_no_event(blocking: bool) -> None:
+    """Nor is one lost where another program has set the pipe not to block."""
     near, far = os.pipe()
+    os.set_blocking(far, blocking)
     told: list[bytes] = []
     with os.fdopen(far, "w") as out, writes_to(out) as write, EventLines(write, "tray", {"u": "run"}) as events:
         out.close()
