@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import select
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -85,7 +86,10 @@ def writes_to(stream: TextIO) -> Iterator[Callable[[bytes], object]]:
 
     def write(data: bytes) -> None:
         while data:
-            data = data[os.write(own, data) :]
+            try:
+                data = data[os.write(own, data) :]
+            except BlockingIOError:  # a pipe that its owner has set so, and that is full
+                select.select([], [own], [])
 
     try:
         yield write

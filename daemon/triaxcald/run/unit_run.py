@@ -697,8 +697,8 @@ class TrayRun:
 
     ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
     maps it to what it is measured for. ``begun`` is called once all attempts are noted
-    on the disk, ``ended`` receives each outcome, ``killed`` each attempt that a killed
-    process has left in the folder.
+    on the disk, or a unit has ended before; ``ended`` then receives each outcome,
+    ``killed`` each attempt that a killed process has left in the folder.
     """
 
     def __init__(
@@ -734,8 +734,13 @@ class TrayRun:
     def __await__(self) -> Generator[Any, None, list[Outcome]]:
         return self._all().__await__()
 
+    def _begin(self) -> None:
+        """Call ``begun``, once."""
+        begun, self._begun = self._begun, lambda: None
+        begun()
+
     async def _open(self) -> None:
-        self._begun()
+        self._begin()
         for killed in await asyncio.to_thread(settle_killed, self._station):
             self._killed(killed)
 
@@ -756,6 +761,7 @@ class TrayRun:
             self._others.leave()
             if self._shown is not None:
                 self._shown.ended(run.name)
+        self._begin()
         self._ended(outcome)
         return outcome
 

@@ -22,6 +22,7 @@ from tests.daemon.audit.forging import Forgery
 from tests.virtual_line import described, virtual_line
 from triaxcald.audit import audit
 from triaxcald.cli.events import EventLines, writes_to
+from triaxcald.errors import DiskError
 from triaxcald.provision.journal import Entry, Journal
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
@@ -182,8 +183,11 @@ def test_a_vanished_reader_of_the_events_stops_nothing() -> None:
             events.stage("u", Stage.POSES)
 
 
-def test_a_reader_that_does_not_read_holds_up_no_event() -> None:
+@pytest.mark.parametrize("blocking", [True, False])
+def test_a_reader_that_does_not_read_holds_up_no_event(blocking: bool) -> None:
+    """Nor is one lost where another program has set the pipe not to block."""
     near, far = os.pipe()
+    os.set_blocking(far, blocking)
     told: list[bytes] = []
     with os.fdopen(far, "w") as out, writes_to(out) as write, EventLines(write, "tray", {"u": "run"}) as events:
         out.close()
@@ -229,6 +233,21 @@ def test_a_unit_that_is_stopped_as_its_tray_starts_gets_its_outcome(workshop: An
     assert left.outcome is not None
     assert right.document["code"] == "absent"
     assert sorted(ended) == ["left", "right"]
+
+
+def test_a_tray_has_started_before_a_unit_of_it_has_ended(
+    workshop: Any, triaxcal: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the disk takes not even the note of an attempt."""
+
+    def full(self: Attempts, *_: object) -> None:
+        raise DiskError("no space left")
+
+    monkeypatch.setattr(Attempts, "begin", full)
+    done = triaxcal("run", workshop.station({"name": "left", "bus": {"host": "127.0.0.1", "port": 1}}), "--events")
+    assert done.code == 5
+    told = [(line["event"], line.get("state")) for line in map(json.loads, done.out.splitlines())]
+    assert told == [("tray", "started"), ("ended", None), ("tray", "ended")]
 
 
 # Killed runs. The recording is cut off at any byte, as a killed process leaves it.
