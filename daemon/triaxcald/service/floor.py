@@ -4,6 +4,7 @@ desk up to date."""
 from __future__ import annotations
 
 import asyncio
+import gc
 import shutil
 import sys
 import time
@@ -212,6 +213,8 @@ class Floor:
                 raise ApiError(Problem.DATABASE, _BLOCKED[Problem.DATABASE])
             self.stream.changed()
             self._task = asyncio.ensure_future(self._run(tray))
+            # Cycles hold its samples and files, and a service looks for garbage seldom.
+            self._task.add_done_callback(lambda _: gc.collect())
             return answer
 
     async def _require_golden(self, due: Mapping[str, str | None]) -> None:

@@ -6,7 +6,7 @@ import asyncio
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
@@ -21,6 +21,25 @@ from triaxcald.service.api import Access
 from triaxcald.service.floor import Floor
 from triaxcald.service.outbox import Outbox
 
+TICK_S: Final = 0.05
+"""From one look at the event loop to the next."""
+
+
+class LoopLateness:
+    """How late the event loop is: something that blocks it delays the units at work and
+    the pages. ``worst_s`` is the greatest lateness since `watch` began."""
+
+    def __init__(self) -> None:
+        self.worst_s = 0.0
+
+    async def watch(self) -> None:
+        """Look until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            due_s = loop.time() + TICK_S
+            await asyncio.sleep(TICK_S)
+            self.worst_s = max(self.worst_s, loop.time() - due_s)
+
 
 class Monitored(Protocol):
     @property
@@ -31,6 +50,9 @@ class Monitored(Protocol):
 
     @property
     def outbox(self) -> Outbox: ...
+
+    @property
+    def lateness(self) -> LoopLateness: ...
 
 
 def health(service: Monitored) -> dict[str, Any]:
@@ -73,10 +95,12 @@ class StationMetrics(Collector):
         listeners.add_metric([], floor.stream.listeners)
         blocked = GaugeMetricFamily("triaxcal_blocked", "1 while no tray can start")
         blocked.add_metric([], float(floor.blocked is not None))
+        late = GaugeMetricFamily("triaxcal_loop_late_seconds", "Greatest lateness of the event loop since the start")
+        late.add_metric([], self._service.lateness.worst_s)
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
         with suppress(OSError):
             free.add_metric([], shutil.disk_usage(floor.station.folder).free)
-        yield from (slots, runs, waiting, refused, age, listeners, blocked, free)
+        yield from (slots, runs, waiting, refused, age, listeners, blocked, late, free)
 
 
 def monitoring_router(service: Monitored) -> APIRouter:

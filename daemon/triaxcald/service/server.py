@@ -9,7 +9,7 @@ import os
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -24,7 +24,7 @@ from triaxcald.service.api_data import data_router
 from triaxcald.service.floor import Floor
 from triaxcald.service.gate import StationServer, configured, known_hosts
 from triaxcald.service.ledger import Ledger
-from triaxcald.service.monitoring import monitoring_router
+from triaxcald.service.monitoring import LoopLateness, monitoring_router
 from triaxcald.service.outbox import Outbox
 from triaxcald.service.page import page_router
 from triaxcald.service.stream import Stream
@@ -59,6 +59,7 @@ class StationService:
     ledger: Ledger
     access: Access
     outbox: Outbox
+    lateness: LoopLateness = field(default_factory=LoopLateness)
 
     @property
     def station(self) -> Station:
@@ -133,6 +134,7 @@ async def _working(
     await floor.stream.begin()
     streaming = asyncio.ensure_future(floor.stream.run())
     delivering = asyncio.ensure_future(outbox.run())
+    watching = asyncio.ensure_future(service.lateness.watch())
     try:
         await floor.begin()
         yield service
@@ -140,7 +142,7 @@ async def _working(
         # Cancelled or not: no device is left in between.
         await floor.end()
         await floor.stream.drained()
-        for task in (delivering, streaming):
+        for task in (watching, delivering, streaming):
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
