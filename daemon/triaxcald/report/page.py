@@ -34,7 +34,7 @@ from triaxcald.report.charts import (
 from triaxcald.report.document import faults_of, left_out, mapping, numbers, read_device, read_document, texts, vector
 from triaxcald.report.figures import factor, in_plain, number, told
 from triaxcald.report.over_time import time_pictures
-from triaxcald.report.verdict import before_after, choices_in, final_word, judge, who_corrects
+from triaxcald.report.verdict import before_after, choices_in, final_word, judge, lacks_fit, who_corrects
 
 # The uncertainty budget of a calibration document, read without trust like the rest
 # of it.
@@ -186,6 +186,7 @@ def render_report(
         rows=before_after(outcome, unit),
         device=device,
         choices=choices_in(document, papers, outcome),
+        lacks_fit=lacks_fit,
         who_corrects=lambda finding: who_corrects(finding, device),
         told=lambda effect: told(effect, outcome.channel_reference),
         bracket=lambda finding: bracket(finding, outcome),

@@ -222,7 +222,12 @@ def _found(outcome: Outcome) -> str:
         each = ", ".join(
             f"{tc.text.traces.effect_title(name).lower()} ({chance(p)})" for name, p in outcome.averaged.items()
         )
-        return f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}. "
+        else_acts = outcome.unexplained.probability if outcome.unexplained is not None else None
+        other = f"; or something that no known effect describes ({chance(else_acts)})" if else_acts is not None else ""
+        return (
+            f"No effect is likely by itself. The correction averages over what may act, by its probability: {each}"
+            f"{other}. "
+        )
     if not outcome.findings and outcome.something_is_left:
         return "Something acts beyond the linear model, and these poses do not tell what. "
     if not outcome.findings:
@@ -271,10 +276,11 @@ def _tested(outcome: Outcome) -> bool:
 def _unexplained(outcome: Outcome) -> bool:
     if outcome.unexplained is not None:
         return outcome.unexplained.significant
-    return _lacks_fit(outcome)
+    return lacks_fit(outcome)
 
 
-def _lacks_fit(outcome: Outcome) -> bool:
+def lacks_fit(outcome: Outcome) -> bool:
+    """Whether the residuals exceed the noise of the poses."""
     p = outcome.final.lack_of_fit_p
     return p is not None and p < tc.poses.LACK_OF_FIT
 
