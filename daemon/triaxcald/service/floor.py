@@ -4,7 +4,6 @@ desk up to date."""
 from __future__ import annotations
 
 import asyncio
-import gc
 import shutil
 import sys
 import time
@@ -15,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from triaxcald.errors import DaemonError, InputError
+from triaxcald.memory import give_back
 from triaxcald.run.attempts import Killed, settle_killed
 from triaxcald.run.events import Events
 from triaxcald.run.golden_unit import golden_calibration
@@ -214,7 +214,7 @@ class Floor:
             self.stream.changed()
             self._task = asyncio.ensure_future(self._run(tray))
             # Cycles hold its samples and files, and a service looks for garbage seldom.
-            self._task.add_done_callback(lambda _: gc.collect())
+            self._task.add_done_callback(lambda _: give_back())
             return answer
 
     async def _require_golden(self, due: Mapping[str, str | None]) -> None:
