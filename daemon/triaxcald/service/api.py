@@ -30,10 +30,12 @@ SEQ_MOST: Final = 2**63 - 1
 
 
 class Who(Protocol):
-    """Who asks: ``name``, and the ``role``."""
+    """Who asks: ``name``, the ``role``, and ``by`` what they are known: `cookie` of one
+    who has signed in, `token` or `loopback`."""
 
     name: str
     role: str
+    by: str
 
 
 class Access(Protocol):
@@ -102,12 +104,12 @@ def station_router(service: Service) -> APIRouter:
     router, floor, access = APIRouter(prefix="/api/1", responses=ERRORS), service.floor, service.access
 
     async def done(
-        request: Request, role: str, action: str, what: Mapping[str, Any], work: Callable[[], Awaitable[Any]]
+        request: Request, role: str, action: str, what: Mapping[str, Any], work: Callable[[Any], Awaitable[Any]]
     ) -> JSONResponse:
         """Do the work for someone with the role, and leave a row in the trail."""
         who = await access.require(request, role)
         try:
-            answer = await work()
+            answer = await work(who)
         except ApiError as e:
             await access.trail(who, action, what, ok=False, code=e.problem.value)
             raise
@@ -143,33 +145,42 @@ def station_router(service: Service) -> APIRouter:
 
     @router.post("/scan")
     async def scan(request: Request, body: ScanBody) -> JSONResponse:
-        return await done(request, "operator", "scan", {"text": body.text}, lambda: floor.scan(body.text))
+        return await done(
+            request, "operator", "scan", {"text": body.text}, lambda who: floor.scan(body.text, _person(who))
+        )
 
     @router.put("/tray", response_model=StationState)
     async def put_tray(request: Request, body: TrayBody) -> JSONResponse:
         given: dict[str, Any] = body.model_dump(exclude_unset=True)
         work: dict[str, str | None] = {key: given[key] for key in WORK if key in given}
-        return await done(request, "operator", "tray", given, lambda: state_after(floor.put(body.slots, work)))
+        return await done(request, "operator", "tray", given, lambda _: state_after(floor.put(body.slots, work)))
 
     @router.post("/tray/start")
     async def start(request: Request, body: StartBody) -> JSONResponse:
         wanted = None if body.request is None else str(body.request)
-        return await done(request, "operator", "start", {"request": wanted}, lambda: floor.start(wanted))
+        return await done(
+            request, "operator", "start", {"request": wanted}, lambda who: floor.start(wanted, _person(who))
+        )
 
     @router.post("/tray/stop")
     async def stop(request: Request, body: StopBody) -> JSONResponse:
-        return await done(request, "operator", "stop", {"reason": body.reason}, lambda: floor.stop(body.reason))
+        return await done(request, "operator", "stop", {"reason": body.reason}, lambda _: floor.stop(body.reason))
 
     @router.post("/tray/clear", response_model=StationState)
     async def clear(request: Request) -> JSONResponse:
-        return await done(request, "operator", "clear", {}, lambda: state_after(floor.clear()))
+        return await done(request, "operator", "clear", {}, lambda _: state_after(floor.clear()))
 
     @router.post("/slots/{slot}/stop")
     async def stop_slot(request: Request, slot: str, body: StopBody) -> JSONResponse:
         what = {"slot": slot, "reason": body.reason}
-        return await done(request, "operator", "stop", what, lambda: floor.stop_slot(slot, body.reason))
+        return await done(request, "operator", "stop", what, lambda _: floor.stop_slot(slot, body.reason))
 
     return router
+
+
+def _person(who: Who) -> str | None:
+    """The name of one who has signed in, and not of a program."""
+    return who.name if who.by == "cookie" else None
 
 
 async def sent(

@@ -214,7 +214,8 @@ class Desk:
 
     def due(self) -> dict[str, str | None]:
         """Expected serial numbers of the slots that a start would run: those that were
-        scanned, or without any those that the station file names."""
+        scanned, or without any those that the station file names. After a
+        tray, a unit is scanned again or the tray cleared."""
         if not (due := self._next_start()):
             raise ApiError(Problem.INVALID, "no unit is scanned; scan the serial number of the unit in each slot")
         return due
@@ -226,6 +227,8 @@ class Desk:
 
     def _next_start(self) -> dict[str, str | None]:
         scanned = {s.slot: s.serial for s in self.slots.values() if s.state is SlotIs.SCANNED}
+        if any(s.state in ENDED.values() for s in self.slots.values()):
+            return scanned  # a unit that has its verdict is not run again unasked
         named: dict[str, str | None] = {s.slot: s.expected for s in self.slots.values() if s.expected is not None}
         return scanned or named
 

@@ -146,20 +146,20 @@ class Floor:
                 return Problem.DISK.value
         return None
 
-    async def scan(self, text: str) -> dict[str, Any]:
-        """Take a scanned text; gives what it was taken for."""
+    async def scan(self, text: str, person: str | None = None) -> dict[str, Any]:
+        """Take a scanned text, by a ``person`` as in `start`; gives what it was."""
         scanned = self.desk.scan(text, now())
         answer = scanned.document()
         if scanned.kind == "command":
-            return {**answer, **await self._command(scanned)}
+            return {**answer, **await self._command(scanned, person)}
         if scanned.kind == "serial":
             self._require_serial(scanned)
         await self._changed()
         return answer
 
-    async def _command(self, scanned: Scanned) -> dict[str, Any]:
+    async def _command(self, scanned: Scanned, person: str | None) -> dict[str, Any]:
         if scanned.value == "START":
-            return await self.start(None)
+            return await self.start(None, person)
         if scanned.value == "STOP":
             return await self.stop("stopped by the operator")
         await self.clear()
@@ -183,9 +183,10 @@ class Floor:
         self.desk.clear(now())
         await self._changed()
 
-    async def start(self, request: str | None) -> dict[str, Any]:
+    async def start(self, request: str | None, person: str | None = None) -> dict[str, Any]:
         """Start the scanned slots. The same ``request`` starts once, and gets the same
-        answer each time."""
+        answer each time. Who has signed in, ``person``, is the operator unless a badge
+        was scanned or the station file names one."""
         async with self._starting:
             if request is not None and request in self.desk.starts:
                 return self.desk.starts[request]
@@ -196,7 +197,7 @@ class Floor:
                 raise ApiError(Problem(trouble), _BLOCKED[Problem(trouble)])
             with self.desk.starting():
                 await self._require_golden(due)
-                tray = await self._made(due)
+                tray = await self._made(due, person)
             if self._stopping:
                 raise ApiError(Problem.RUNNING, "the service is about to end")
             runs = {slot: unit.run for slot, unit in tray.units.items()}
@@ -280,11 +281,13 @@ class Floor:
 
     # A tray.
 
-    async def _made(self, due: Mapping[str, str | None]) -> TrayRun:
+    async def _made(self, due: Mapping[str, str | None], person: str | None) -> TrayRun:
         """The units of these slots, ready to run."""
         station = self.station
         station = replace(station, places=tuple(p for p in station.places if p.unit.name in due))
         given = {key: value for key, value in self.desk.work.items() if value is not None}
+        if person is not None:
+            given.setdefault("operator", person)
         scanned = [(slot, serial) for slot, serial in due.items() if serial is not None]
         try:
             station = with_serials(station, scanned)

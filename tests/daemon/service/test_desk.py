@@ -138,6 +138,17 @@ def test_without_a_scan_a_start_is_of_the_units_that_the_station_file_names() ->
     assert desk.due() == {"a": "1002"}  # a number of the station file does not occupy its slot
 
 
+@pytest.mark.parametrize("verdict", ["pass", "fail", "aborted"])
+def test_a_unit_that_has_its_verdict_is_not_started_again_before_a_scan_or_a_clear(verdict: str) -> None:
+    desk = Desk("line 1", [("a", "7"), ("b", None)], {}, OWN_NAMES, AT)
+    runs = begin(desk)
+    desk.ended("a", outcome(runs["a"], verdict), LATER)
+    assert refused(desk.due) == "invalid"
+    assert desk.waiting == {}
+    desk.clear(LATER)
+    assert desk.due() == {"a": "7"}
+
+
 def test_while_units_are_at_work_nothing_is_scanned(desk: Desk) -> None:
     desk.scan("1001", AT)
     begin(desk)

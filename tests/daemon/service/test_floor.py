@@ -4,6 +4,7 @@ again, an end of the service, a scan."""
 from __future__ import annotations
 
 import asyncio
+import json
 import sqlite3
 import threading
 from collections.abc import AsyncIterator, Callable
@@ -241,3 +242,23 @@ async def test_no_tray_starts_once_the_service_ends(make_station: Callable[..., 
         assert caught.value.message == "the service is about to end"
         assert floor._task is None
         assert floor.desk.slots["a"].serial == "1001"
+
+
+# Who the operator is.
+
+
+@pytest.mark.parametrize(
+    ("work", "badge", "expected"),
+    [("", None, "Ada"), ("", "Ben", "Ben"), ('[work]\noperator = "Cyd"\n', None, "Cyd")],
+)
+async def test_who_has_signed_in_is_the_operator_unless_another_is_named(
+    make_station: Callable[..., Station], tmp_path: Path, work: str, badge: str | None, expected: str
+) -> None:
+    async with at_work(make_station("[plan]\ncomes_back_s = 0.0\n" + work)) as (floor, _):
+        if badge:
+            await floor.scan(f"OP:{badge}")
+        await floor.scan("1001")
+        await floor.scan("CMD:START", "Ada")
+        await over(floor)
+    (path,) = tmp_path.glob("*.outcome.json")
+    assert json.loads(path.read_text())["work"]["operator"] == expected

@@ -98,7 +98,7 @@ class PlayedFloor(Floor):
     played: PlayedTray | None = None
     starts = 0
 
-    async def _made(self, due: Mapping[str, str | None]) -> Any:
+    async def _made(self, due: Mapping[str, str | None], person: str | None) -> Any:
         if self.passed & set(due.values()) and not self.desk.work["reason"]:
             raise ApiError(
                 Problem.REASON_MISSING, "a unit of this tray has passed before; give the reason of the re-test"
