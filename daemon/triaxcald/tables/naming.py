@@ -65,6 +65,8 @@ NOT_CELSIUS = frozenset(("f", "fahrenheit", "k", "kelvin", "raw", "mv", "v", "ad
 UNCERTAINTIES = frozenset(
     ("se", "sem", "std", "sd", "stderr", "stdev", "sigma", "error", "err", "unc", "uncertainty", "var")
 )
+STANDARD_ERRORS = frozenset(("se", "sem", "stderr"))
+"""Of means, and not the spread of samples."""
 WITHOUT_GRAVITY = frozenset(
     ("linear", "lin", "linacc", "linaccel", "user", "useracceleration", "free", "freeacc", "dynamic")
 )
@@ -175,6 +177,14 @@ class Name:
         return "angular" not in self.words and bool(set(self.words) & (COMPUTED | TURNED | UNCERTAINTIES))
 
     @property
+    def is_uncertainty(self) -> bool:
+        return bool(set(self.words) & UNCERTAINTIES)
+
+    @property
+    def is_standard_error(self) -> bool:
+        return bool(set(self.words) & STANDARD_ERRORS) or {"standard", "error"} <= set(self.words)
+
+    @property
     def is_either(self) -> bool:
         """T is a temperature as well as a time: it is a time only where no
         other column is, and where it rises."""
@@ -268,10 +278,27 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
         called = [i for i in called if not parsed[i].is_either] or called
         time = tuple(sorted(called, key=lambda i: parsed[i].is_of_another_sensor))
     channels = {role: i for role, i in given.items() if role not in (TIME, *OUTPUTS)}
-    for i in others:  # standard errors by our own names
-        if named and parsed[i].text in ERRORS:
-            channels[parsed[i].text] = i
+    if named:
+        channels |= _standard_errors(parsed, others, parsed[outputs[0]].unit)
     return Roles(outputs, time, indices, channels, frozenset(said), rivals)
+
+
+def _standard_errors(names: Sequence[Name], columns: Sequence[int], unit: str) -> dict[str, int]:
+    """The columns of standard errors of pose means, by their roles: those with our
+    own names, else three in the ``unit`` of the outputs that are called so and
+    differ by the axis, as se_x or stderr ay."""
+    own = {names[i].text: i for i in columns if names[i].text in ERRORS}
+    if own:
+        return own
+    found: dict[str, int] = {}
+    for i in columns:
+        axes = {word[-1] for word in names[i].words if len(word) <= 2 and word[-1] in AXES}
+        if names[i].is_standard_error and len(axes) == 1 and names[i].unit in ("", unit):
+            role = ERRORS[AXES.index(axes.pop())]
+            if role in found:
+                return {}
+            found[role] = i
+    return found if len(found) == len(ERRORS) else {}
 
 
 def seconds_and_rest(names: Sequence[str]) -> Iterator[tuple[int, int]]:

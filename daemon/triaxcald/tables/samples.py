@@ -21,6 +21,7 @@ from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
 from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import (
+    ERRORS,
     INDEX,
     ISO,
     OUTPUTS,
@@ -468,6 +469,8 @@ def _another_quantity(grid: Grid, roles: Roles, name: Name, i: int, rows: NDArra
         return "other outputs"
     if grid.named and name.is_without_gravity:
         return "without gravity"
+    if grid.named and name.is_uncertainty:
+        return "an uncertainty; standard errors of pose means are called se_ux, se_uy, se_uz"
     if grid.named and name.is_computed:
         return "computed from the outputs"
     return None
@@ -680,7 +683,8 @@ def _read_as(grid: Grid, roles: Roles, timing: Timing, renamed: Mapping[str, int
     else:
         parts.append(f"t = rows, {timing.said}")
     parts += [f"{axis} = {_shown(grid, i)}" for axis, i in zip(OUTPUTS, roles.outputs, strict=True)]
-    parts += [f"{channel} = {_shown(grid, i)}" for channel, i in renamed.items() if channel != _shown(grid, i)]
+    errors = {role: i for role, i in roles.channels.items() if role in ERRORS}
+    parts += [f"{role} = {_shown(grid, i)}" for role, i in {**errors, **renamed}.items() if role != _shown(grid, i)]
     return f"read as {', '.join(parts)}" + ("" if set(reading.columns) >= {*OUTPUTS} else " (else: --columns)")
 
 

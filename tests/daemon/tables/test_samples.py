@@ -124,6 +124,25 @@ def test_rows_that_are_means_of_poses_need_no_time(tmp_path: Path) -> None:
     assert table.output_unit == "V"
 
 
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ("se_x;se_y;se_z", True),
+        ("x stderr [V];y stderr [V];z stderr [V]", True),
+        ("SEM aX;SEM aY;SEM aZ", True),
+        ("Standard Error X;Standard Error Y;Standard Error Z", True),
+        ("se_x [mV];se_y [mV];se_z [mV]", False),  # another unit than the outputs
+        ("se_x;se_y;other", False),
+        ("std_x;std_y;std_z", False),  # the spread of the samples
+    ],
+)
+def test_standard_errors_of_pose_means_are_found_by_their_names(tmp_path: Path, columns: str, expected: bool) -> None:
+    rows = "".join(f"{i};{-i};{i * i};0,01;0,03;0,02\n" for i in range(1, 5))
+    table = read(tmp_path, f"X [V];Y [V];Z [V];{columns}\n{rows}", Reading(pose_means=True))
+    held = {name: float(values[0]) for name, values in table.samples.channels.items() if name.startswith("se_u")}
+    assert held == ({"se_ux": 0.01, "se_uy": 0.03, "se_uz": 0.02} if expected else {})
+
+
 def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
     assert len(EXPORTS) >= 40
     assert len({e.program for e in EXPORTS}) == len(EXPORTS)
