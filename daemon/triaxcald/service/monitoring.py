@@ -19,6 +19,7 @@ from triaxcald.schema.codes import Verdict
 from triaxcald.schema.station_state import SlotIs
 from triaxcald.service.api import Access
 from triaxcald.service.floor import Floor
+from triaxcald.service.ledger import Ledger
 from triaxcald.service.outbox import Outbox
 
 
@@ -30,16 +31,21 @@ class Monitored(Protocol):
     def access(self) -> Access: ...
 
     @property
+    def ledger(self) -> Ledger: ...
+
+    @property
     def outbox(self) -> Outbox: ...
 
 
 def health(service: Monitored) -> dict[str, Any]:
-    """``healthy`` where the next tray could start and no result is refused."""
-    floor, deliveries = service.floor, service.outbox.status()
+    """``healthy`` where the next tray could start, and the database was not lost since
+    the service began: ``database_lost`` says what people have to do."""
+    floor, deliveries, lost = service.floor, service.outbox.status(), service.ledger.lost
     return {
         "format": "triaxcal.health/1",
-        "healthy": floor.blocked is None,
+        "healthy": floor.blocked is None and lost is None,
         "blocked": floor.blocked,
+        "database_lost": lost,
         "slots": [{"slot": s.slot, "state": s.state.value, "serial": s.serial} for s in floor.desk.slots.values()],
         "runs": dict(floor.counts),
         "outbox": [d.document() for d in deliveries],
@@ -73,10 +79,14 @@ class StationMetrics(Collector):
         listeners.add_metric([], floor.stream.listeners)
         blocked = GaugeMetricFamily("triaxcal_blocked", "1 while no tray can start")
         blocked.add_metric([], float(floor.blocked is not None))
+        losses = CounterMetricFamily(
+            "triaxcal_database_losses", "Times the database was damaged or removed since the service began"
+        )
+        losses.add_metric([], self._service.ledger.losses)
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
         with suppress(OSError):
             free.add_metric([], shutil.disk_usage(floor.station.folder).free)
-        yield from (slots, runs, waiting, refused, age, listeners, blocked, free)
+        yield from (slots, runs, waiting, refused, age, listeners, blocked, losses, free)
 
 
 def monitoring_router(service: Monitored) -> APIRouter:
