@@ -21,7 +21,7 @@ from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Stage, Verdict
 from triaxcald.schema.event import KINDS, Event, Head
 from triaxcald.schema.outcome import Outcome
-from triaxcald.schema.quality import Quality
+from triaxcald.schema.quality import Chart, Quality
 from triaxcald.schema.result import Result
 from triaxcald.schema.results import Results
 from triaxcald.schema.run import Demo, Run
@@ -44,6 +44,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "results": Results,
     "station-state": StationState,
     "quality": Quality,
+    "chart": Chart,
     "result": Result,
 }
 JSON_TYPES = {
@@ -168,7 +169,13 @@ QUALITY = """# Quality
 
 The [service](../how-to/run-a-station.md) answers GET `/api/1/quality` by `triaxcal.quality/1`.
 
-Made from the model in `daemon/triaxcald/schema/quality.py` by `docs/reference/documents.py`; [JSON Schema](quality.schema.json).
+Made from the models in `daemon/triaxcald/schema/quality.py` by `docs/reference/documents.py`; JSON Schema of [quality](quality.schema.json) and [chart](chart.schema.json).
+
+"""  # noqa: E501
+CHART = """
+## Chart
+
+GET `/api/1/charts?name=NAME`, with the filters of `/quality`, answers `triaxcal.chart/1`: individuals and moving ranges of two, by the end of the attempts. One value a unit, chosen as above.
 
 """  # noqa: E501
 RESULT = """# Result for receivers
@@ -199,7 +206,7 @@ def pages() -> dict[Path, str]:
         "event": _event(),
         "results": RESULTS + _keys(Results),
         "station-state": STATION_STATE + _keys(StationState) + "\n## State of a slot\n\n" + _words("state", SlotIs),
-        "quality": QUALITY + _keys(Quality),
+        "quality": QUALITY + _keys(Quality) + CHART + _keys(Chart),
         "result": RESULT + _keys(Result),
     }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}

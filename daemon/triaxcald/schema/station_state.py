@@ -48,6 +48,9 @@ class SlotState(tc.schema.Model):
     reason: Annotated[tc.schema.Text | None, Field(description="the same for people, one sentence")]
     next: Annotated[NextPose | None, Field(description="the next pose of this unit; `null` if there is none")] = None
     since: Annotated[str, Field(description="time since which the slot is in this state, UTC")]
+    blocked: Annotated[
+        str | None, Field(description="code of what keeps this slot from the next start; else `null`")
+    ] = None
 
 
 class WorkOfTray(tc.schema.Model):
@@ -90,4 +93,8 @@ class StationState(tc.schema.Model):
             description="slots of the next start whose golden unit is due or has failed, if `blocked` says so",
         ),
     ]
+    chosen: Annotated[
+        str | None,
+        Field(description="slot that was scanned for the next serial number; `null`: the next empty one takes it"),
+    ] = None
     slots: Annotated[list[SlotState], Field(description="the slots, in the order of the station file")]

@@ -99,7 +99,8 @@ class Desk:
         self.tray: str | None = None
         self.instruction: dict[str, Any] | None = None
         self.blocked: str | None = None
-        self.blocked_slots: list[str] = []
+        self.blocked_slots: Mapping[str, str] = {}
+        """Codes by slot."""
         self.chosen: str | None = None
         self.starts: dict[str, dict[str, Any]] = {}
         """Answers to requests to start, by their id."""
@@ -130,7 +131,10 @@ class Desk:
             "instruction": self.instruction or self._of_the_only_unit(),
             "blocked": self.blocked,
             "blocked_slots": list(self.blocked_slots),
-            "slots": [slot.document() for slot in self.slots.values()],
+            "chosen": self.chosen,
+            "slots": [
+                {**slot.document(), "blocked": self.blocked_slots.get(slot.slot)} for slot in self.slots.values()
+            ],
         }
 
     def _of_the_only_unit(self) -> dict[str, Any] | None:
@@ -294,6 +298,7 @@ class Desk:
             "slots": [slot.document() for slot in self.slots.values()],
             "work": dict(self.work),
             "tray": self.tray,
+            "chosen": self.chosen,
             "starts": dict(self.starts),
         }
 
@@ -312,6 +317,7 @@ class Desk:
                 slot.reason = "the service ended during the run"
         self.work.update({key: value for key, value in kept.get("work", {}).items() if key in WORK})
         self.tray, self.starts = kept.get("tray"), dict(kept.get("starts", {}))
+        self.chosen = chosen if (chosen := kept.get("chosen")) in self.slots else None
 
     # Checks.
 

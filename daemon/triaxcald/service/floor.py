@@ -121,7 +121,7 @@ class Floor:
         """The `triaxcal.station_state/1` after the event ``seq``."""
         slots = self._golden_blocked()
         self.desk.blocked = self._blocked(slots)
-        self.desk.blocked_slots = list(slots) if self.desk.blocked in list(slots.values()) else []
+        self.desk.blocked_slots = slots if self.desk.blocked in list(slots.values()) else {}
         return self.desk.document(seq)
 
     @property

@@ -129,6 +129,8 @@ class Ledger:
         self.station, self.folder = station, folder
         self.lost: str | None = None
         """What people have to do where the file was damaged or removed."""
+        self.losses = 0
+        """How often that was."""
         self._file = SqliteFile(self.folder / FILE_NAME, self._prepare_file) if url is None else None
         self.engine: Engine = postgresql_engine(url) if url is not None else self._sqlite_file.engine
         self.home = tables.HERE if url is None else self.station
@@ -217,6 +219,7 @@ class Ledger:
             db.exec_driver_sql("CREATE INDEX IF NOT EXISTS run_at ON run (at_us, outcome)")
         before = self._join_trail(engine)
         if not known and (before or suspect):
+            self.losses += 1
             self.lost = (
                 f"{path}: the database was damaged or removed, and is made anew from the folder: "
                 "people and tokens have to be entered anew"

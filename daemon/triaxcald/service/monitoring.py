@@ -19,6 +19,7 @@ from triaxcald.schema.codes import Verdict
 from triaxcald.schema.station_state import SlotIs
 from triaxcald.service.api import Access
 from triaxcald.service.floor import Floor
+from triaxcald.service.ledger import Ledger
 from triaxcald.service.outbox import Outbox
 
 TICK_S: Final = 0.05
@@ -49,6 +50,9 @@ class Monitored(Protocol):
     def access(self) -> Access: ...
 
     @property
+    def ledger(self) -> Ledger: ...
+
+    @property
     def outbox(self) -> Outbox: ...
 
     @property
@@ -56,12 +60,14 @@ class Monitored(Protocol):
 
 
 def health(service: Monitored) -> dict[str, Any]:
-    """``healthy`` where the next tray could start and no result is refused."""
-    floor, deliveries = service.floor, service.outbox.status()
+    """``healthy`` where the next tray could start, and the database was not lost since
+    the service began: ``database_lost`` says what people have to do."""
+    floor, deliveries, lost = service.floor, service.outbox.status(), service.ledger.lost
     return {
         "format": "triaxcal.health/1",
-        "healthy": floor.blocked is None,
+        "healthy": floor.blocked is None and lost is None,
         "blocked": floor.blocked,
+        "database_lost": lost,
         "slots": [{"slot": s.slot, "state": s.state.value, "serial": s.serial} for s in floor.desk.slots.values()],
         "runs": dict(floor.counts),
         "outbox": [d.document() for d in deliveries],
@@ -97,10 +103,14 @@ class StationMetrics(Collector):
         blocked.add_metric([], float(floor.blocked is not None))
         late = GaugeMetricFamily("triaxcal_loop_late_seconds", "Greatest lateness of the event loop since the start")
         late.add_metric([], self._service.lateness.worst_s)
+        losses = CounterMetricFamily(
+            "triaxcal_database_losses", "Times the database was damaged or removed since the service began"
+        )
+        losses.add_metric([], self._service.ledger.losses)
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
         with suppress(OSError):
             free.add_metric([], shutil.disk_usage(floor.station.folder).free)
-        yield from (slots, runs, waiting, refused, age, listeners, blocked, late, free)
+        yield from (slots, runs, waiting, refused, age, listeners, blocked, late, losses, free)
 
 
 def monitoring_router(service: Monitored) -> APIRouter:

@@ -153,6 +153,7 @@ def _rendered(
         "faces": file.fixture.names,
         "together": file.fixture.together,
         "operator": file.rules.operator,
+        "golden": None if file.rules.golden is None else file.rules.golden.serial,
         **given,
     }
     page = _templates().get_template(f"{name}.html").render(

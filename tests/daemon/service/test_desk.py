@@ -91,6 +91,20 @@ def test_a_chosen_slot_takes_the_next_serial_number_though_it_has_one(desk: Desk
     assert states(desk) == {"a": ("scanned", "1000"), "b": ("empty", None), "c": ("scanned", "1003")}
 
 
+def test_the_state_names_the_chosen_slot_also_after_a_restart(desk: Desk) -> None:
+    assert desk.document(0)["chosen"] is None
+    desk.scan("SLOT:c", AT)
+    assert desk.document(0)["chosen"] == "c"
+    again = Desk("line 1", [("a", None), ("b", None), ("c", None)], {}, OWN_NAMES, LATER)
+    again.restore(desk.kept(), LATER)
+    assert again.document(0)["chosen"] == "c"
+    smaller = Desk("line 1", [("a", None)], {}, OWN_NAMES, LATER)
+    smaller.restore(desk.kept(), LATER)
+    assert smaller.document(0)["chosen"] is None
+    again.scan("1001", LATER)
+    assert (again.document(0)["chosen"], states(again)["c"]) == (None, ("scanned", "1001"))
+
+
 @pytest.mark.parametrize("same", ["1001", "001001"])
 def test_one_unit_is_in_one_slot(desk: Desk, same: str) -> None:
     desk.scan("1001", AT)

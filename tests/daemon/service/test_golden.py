@@ -219,6 +219,8 @@ async def refused(floor: Floor, problem: Problem, slots: list[str]) -> str:
     assert caught.value.problem.status == 409
     state = StationState.model_validate(floor.state(0)).document()
     assert (state["blocked"], state["blocked_slots"]) == (problem.value, slots)
+    assert [slot["slot"] for slot in state["slots"] if slot["blocked"]] == slots
+    assert problem.value in [slot["blocked"] for slot in state["slots"]]
     return caught.value.message
 
 

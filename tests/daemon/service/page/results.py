@@ -16,17 +16,23 @@ FAILED = {
 RUNS = 55
 RETESTED = "SN-1005"
 LIMIT_G, FAILED_G = 5e-5, 6.3e-5
+FIRST_LIMIT_G, CHANGED_AT = 7e-5, 12
+"""With ``changed`` the limit of the first runs was another."""
 SLASHED = "A/1 <b>#?"
 XSS = "<img src=x onerror=window.caught=1>"
 
 
-def written(folder: Path) -> list[dict[str, Any]]:
+def written(folder: Path, *, changed: bool = False) -> list[dict[str, Any]]:
     """The outcomes, oldest first."""
     folder.mkdir(exist_ok=True)
     found = []
     for i in range(RUNS):
         serial = {50: RETESTED, 51: RETESTED, RUNS - 2: SLASHED, RUNS - 1: XSS}.get(i, f"SN-{1000 + i}")
         document = _outcome(i, FAILED.get(i, Code.WITHIN_LIMITS), serial, attempt=i - 48 if i in (50, 51) else 1)
+        if changed and i < CHANGED_AT and document["verification"] is not None:
+            document["limits"]["verification_rms_g"] = document["verification"]["limit_rms_g"] = FIRST_LIMIT_G
+            if document["verdict"] == Verdict.FAIL:
+                document["verification"]["after_rms_g"] = FIRST_LIMIT_G + FAILED_G - LIMIT_G
         (folder / f"run-{i:03d}.outcome.json").write_text(to_text(document), encoding="utf-8")
         found.append(document)
     return found

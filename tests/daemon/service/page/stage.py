@@ -59,10 +59,14 @@ def station_file(
     together: bool = True,
     operator: bool = True,
     open_loopback: bool = True,
+    golden: str | None = None,
 ) -> Path:
     faces = ", ".join(f'"{axis}" = "{face}"' for axis, face in FACES.items())
     given = {"together": together, "operator": operator, "open_loopback": open_loopback}
     text = STATION.format(name=name, faces=faces, **{key: str(value).lower() for key, value in given.items()})
+    if golden is not None:
+        rule = f'[rules]\ngolden = {{ serial = "{golden}", every_h = 24, calibration = "golden.json" }}'
+        text = text.replace("[rules]", rule)
     text += "".join(UNIT.format(slot=slot, node=5 + i) for i, slot in enumerate(slots))
     path = folder / "station.toml"
     path.write_text(text, encoding="utf-8")

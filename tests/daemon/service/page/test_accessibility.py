@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from tests.daemon.service.page.conftest import Opened
 from tests.daemon.service.page.results import RETESTED, written
-from tests.daemon.service.page.stage import Stage, direction
+from tests.daemon.service.page.stage import Stage, direction, station_file
 from tests.daemon.service.page.test_operator_page import ended, in_poses
 
 pytestmark = pytest.mark.slow
@@ -59,11 +61,27 @@ def test_the_operators_page(stage: Stage, opened: Opened, name: str, theme: str)
 
 
 @pytest.mark.parametrize("theme", THEMES)
+def test_chosen_and_blocked_slots(tmp_path: Path, browser: Browser, theme: str) -> None:
+    stage = Stage(station_file(tmp_path, golden="G-17"))
+    stage.begin()
+    stage.scan("OP:Olena", "SN-1", "SN-2", "SLOT:b")
+    page = browser.new_page()
+    page.goto(f"{stage.url}/?theme={theme}")
+    expect(page.locator(".card.blocked")).to_have_count(2)
+    assert serious(page) == []
+    stage.scan("SLOT:c")
+    expect(page.locator(".card.empty.chosen")).to_have_count(1)
+    assert serious(page) == []
+    page.close()
+    stage.end()
+
+
+@pytest.mark.parametrize("theme", THEMES)
 @pytest.mark.parametrize(
     "path", ["/runs", "/runs/{run}", f"/units/{RETESTED}", "/quality", "/sign-in", "/runs/unknown"]
 )
 def test_the_other_pages(stage: Stage, opened: Opened, path: str, theme: str) -> None:
-    runs = written(stage.station.parent / "out")
+    runs = written(stage.station.parent / "out", changed=True)
     stage.ledger.take()
     page = opened(f"{path.format(run=runs[5]['run'])}?theme={theme}")
     expect(page.locator("#content[aria-busy]")).to_have_count(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -425,6 +426,104 @@ def test_what_blocks_the_next_start_is_said(stage: Stage, opened: Opened) -> Non
     )
     scan(page, "CMD:START")
     expect(page.locator("#error-title")).to_have_text("The database does not answer.")
+
+
+GOLDEN = "G-17"
+STILL_A_HYPHEN = "\u2011"
+
+
+@pytest.fixture
+def golden(tmp_path: Path) -> Iterator[Stage]:
+    """A station where no slot has seen its golden unit."""
+    stage = Stage(station_file(tmp_path, golden=GOLDEN))
+    stage.begin()
+    yield stage
+    stage.end()
+
+
+def read_at_3_m(found: Locator, mm: float) -> bool:
+    """Whether capitals are that high on a screen with 0.28 mm a pixel."""
+    size: float = found.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")
+    return 0.73 * size * 0.28 >= mm
+
+
+def test_the_chosen_slot_has_a_frame_and_a_word(stage: Stage, opened: Opened) -> None:
+    stage.scan("OP:Olena", *SERIALS[:2])
+    page = opened(viewport={"width": 1920, "height": 1080})
+    expect(page.locator(".card.chosen, .chosen-note")).to_have_count(0)
+    scan(page, "SLOT:b")
+    chosen = page.locator(".card.chosen")
+    expect(chosen).to_have_attribute("aria-label", "Slot b")
+    expect(chosen.locator(".chosen-note")).to_have_count(1)
+    assert read_at_3_m(chosen.locator(".chosen-note"), 7)
+    widths = page.locator(".card").evaluate_all("all => all.map(c => parseFloat(getComputedStyle(c).borderTopWidth))")
+    assert [width >= 6 for width in widths] == [False, True, False, False]
+    expect(page.locator("#task-title")).to_contain_text("slot b")
+    expect(page.locator("#task-more")).to_contain_text(SERIALS[1].replace("-", STILL_A_HYPHEN))
+    scan(page, "SLOT:d")
+    expect(chosen).to_have_attribute("aria-label", "Slot d")
+    page.reload()
+    expect(chosen).to_have_attribute("aria-label", "Slot d")
+    stage.end()
+    stage.begin()
+    page.reload()
+    expect(chosen).to_have_attribute("aria-label", "Slot d")
+    scan(page, "SN-9")
+    expect(card(page, "d")).to_contain_text("SN-9")
+    expect(chosen).to_have_count(0)
+
+
+def test_a_choice_of_an_empty_tray_can_be_taken_back(stage: Stage, opened: Opened) -> None:
+    stage.scan("OP:Olena", "SLOT:c")
+    page = opened()
+    expect(page.locator(".card.chosen")).to_have_count(1)
+    page.locator("#clear").click()
+    expect(page.locator(".card.chosen")).to_have_count(0)
+    expect(page.locator("#clear")).to_be_disabled()
+
+
+@pytest.mark.parametrize("language", ["en", "de", "uk"])
+def test_a_blocked_slot_says_why_and_what_to_do(golden: Stage, browser: Browser, language: str) -> None:
+    page = browser.new_page(viewport={"width": 1920, "height": 1080})
+    page.goto(f"{golden.url}/?lang={language}")
+    golden.scan("OP:Olena", "SN-1", "SLOT:c", "SN-3")
+    blocked = page.locator(".card.blocked")
+    expect(blocked).to_have_count(2)
+    assert blocked.evaluate_all("all => all.map(c => c.querySelector('.slot').innerText)") == ["a", "c"]
+    serial = GOLDEN.replace("-", STILL_A_HYPHEN)
+    for note in blocked.locator(".blocked-note").all():
+        expect(note).to_have_attribute("data-code", "golden_due")
+        expect(note).to_contain_text(serial)
+        assert read_at_3_m(note.locator(".stage"), 9)
+        assert read_at_3_m(note.locator("p").last, 6)
+    expect(page.locator("#task.warn #task-more")).to_contain_text(serial)
+    expect(page.locator("#task-more")).to_contain_text("a, c")
+    golden.scan("SLOT:a", GOLDEN)  # it may always run
+    expect(blocked).to_have_count(1)
+    expect(page.locator("#task.warn #task-more")).to_contain_text(serial)
+    page.close()
+
+
+@pytest.mark.parametrize("language", ["en", "de", "uk"])
+@pytest.mark.parametrize("size", [(1920, 1080), (1180, 820), (820, 1180), (400, 800)])
+def test_chosen_and_blocked_slots_fit_their_cards(
+    golden: Stage, browser: Browser, size: tuple[int, int], language: str
+) -> None:
+    golden.scan("OP:Olena", *SERIALS, "SLOT:b")
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.goto(f"{golden.url}/?lang={language}")
+    expect(page.locator(".card.blocked")).to_have_count(4)
+    expect(page.locator(".card.blocked.chosen")).to_have_count(1)
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    if size[0] > 400:
+        assert page.evaluate("document.documentElement.scrollHeight") <= size[1]
+    cut = page.eval_on_selector_all(
+        ".card, .task, .command select, .command button",
+        "all => all.filter(e => e.scrollWidth > e.clientWidth + 1 || e.scrollHeight > e.clientHeight + 1)"
+        ".map(e => e.outerHTML)",
+    )
+    assert cut == []
+    page.close()
 
 
 def test_the_stream_alone_tells_the_state(stage: Stage, opened: Opened) -> None:

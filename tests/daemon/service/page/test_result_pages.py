@@ -178,6 +178,41 @@ def test_quality_shows_yield_reasons_and_charts(runs: list[dict[str, Any]], open
     expect(page.locator("tr", has=page.get_by_role("button", name="Bias x"))).to_contain_text("no limit")
 
 
+def test_quality_tells_and_marks_what_is_outside_and_where_the_limit_changed(stage: Stage, opened: Opened) -> None:
+    written(stage.station.parent / "out", changed=True)
+    stage.ledger.take()
+    page = opened("/quality")
+    page.get_by_label("Control chart").select_option("verification_rms_g")
+    chart = page.locator("figure").first
+    outside = [i for i, code in FAILED.items() if code is Code.VERIFICATION_OUTSIDE and f"SN-{1000 + i}" != RETESTED]
+    expect(chart.locator(".beyond")).to_have_count(len(outside) + 1)  # FIT_OUTSIDE has check poses here, too
+    expect(page.locator("[data-outside]")).to_have_attribute("data-outside", str(len(outside) + 1))
+    expect(page.locator(".beside.changed")).to_have_count(1)
+    expect(chart.locator(".spec")).to_have_count(2)
+    expect(chart.locator("line.change")).to_have_count(1)
+    expect(chart.locator("text.change")).to_have_text("50")
+    row = page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))
+    expect(row.locator(".outside")).to_have_text(f"▲ {len(outside) + 1}")
+    # In black on white as well: a shape with an outline, over the point.
+    page.emulate_media(media="print")
+    expect(page.locator(".beside.changed")).to_be_visible()
+    for mark, least_px in ((chart.locator(".beyond").first, 8), (chart.locator("line.change"), 150)):
+        stroke, height = mark.evaluate("e => [getComputedStyle(e).stroke, e.getBoundingClientRect().height]")
+        assert (stroke, height >= least_px) == ("rgb(0, 0, 0)", True)
+    page.emulate_media(media="screen")
+    page.get_by_role("button", name="Bias x").click()
+    expect(page.locator(".beside")).to_have_count(0)
+    expect(chart.locator(".beyond, .spec, .change")).to_have_count(0)
+
+
+def test_quality_of_one_limit_speaks_of_no_change(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/quality")
+    page.get_by_label("Control chart").select_option("verification_rms_g")
+    expect(page.locator("[data-outside]")).to_have_count(1)
+    expect(page.locator("figure").first.locator(".beyond")).to_have_count(3)
+    expect(page.locator(".change, .changed")).to_have_count(0)
+
+
 def test_quality_gives_no_ppk_below_30_units(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/quality?slot=a")
     row = page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))

@@ -38,13 +38,13 @@ function marked(marks) {
   return marks.map((v) => figure(v, 9));
 }
 
-/** Axes for the values; `below` is the room for what stands under them. */
-function frame({ title, width, height, below, role = "img" }, values) {
+/** Axes for the values; `below` and `over` are the room for what stands there. */
+function frame({ title, width, height, below, over = 10, role = "img" }, values) {
   const seen = sure(values);
   let [low, high] = [Math.min(...seen), Math.max(...seen)];
   const margin = (high - low || Math.abs(high) * 0.1 || 1) * 0.07;
   [low, high] = [low - margin, high + margin];
-  const [top, bottom] = [10, height - below];
+  const [top, bottom] = [over, height - below];
   const y = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
   const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "chart", role, "aria-label": title });
   const marks = ticks(low, high, Math.max(3, Math.round((bottom - top) / 45)));
@@ -56,23 +56,50 @@ function frame({ title, width, height, below, role = "img" }, values) {
   return { picture, y, top, bottom };
 }
 
-/** A control chart: `points` [{value, label, href, mark}] in their
- * order, `mark` null, `outside` (a square) or `run` (a diamond), `lines`
- * [{value, kind}] of the kinds `centre`, `control` and `spec`. */
-export function controlChart({ title, points, lines, width, height = 240 }) {
+/** A control chart: `points` [{value, label, href, mark, beyond, limit}] in their
+ * order, `mark` null, `outside` (a square) or `run` (a diamond), `beyond` whether it is
+ * above the limit of the station (a triangle over it), `lines` [{value, kind}] of the
+ * kinds `centre`, `control` and `spec`. With `limits` the line of the station's limit is
+ * that of each point, with an upright line where it changed. */
+export function controlChart({ title, points, lines, limits = false, width, height = 240 }) {
   const shown = lines.filter((line) => line.value !== null && line.value !== undefined);
-  const { picture, y } = frame({ title, width, height, below: 10, role: "group" }, [...points.map((p) => p.value), ...shown.map((line) => line.value)]);
+  const own = limits ? points.map((p) => p.limit) : [];
+  const { picture, y, top, bottom } = frame({ title, width, height, below: 10, over: limits ? 26 : 10, role: "group" },
+    [...points.map((p) => p.value), ...shown.map((line) => line.value), ...own]);
   const x = (i) => LEFT + 10 + (points.length < 2 ? 0.5 : i / (points.length - 1)) * (width - LEFT - 20);
   for (const { value, kind } of shown) picture.append(svg("line", { x1: LEFT, x2: width, y1: y(value), y2: y(value), class: kind }));
+  if (limits) drawLimits(picture, own, { x, y, top, bottom, right: width });
   const drawn = points.map((p, i) => ({ ...p, i })).filter((p) => p.value !== null);
   picture.append(svg("path", { d: pathOf(drawn.map((p) => [x(p.i), y(p.value)])), class: "line" }));
   const size = points.length > 120 ? 2.2 : points.length > 60 ? 3 : 4;
   for (const p of drawn) {
     const [cx, cy] = [x(p.i), y(p.value)];
     const mark = svg("path", { d: MARKS[p.mark ?? "none"](cx, cy, size), class: `point ${p.mark ?? ""}` }, svg("title", {}, p.label));
-    picture.append(p.href ? linked(p.href, p.label, mark) : mark);
+    const beyond = p.beyond ? svg("path", { d: BEYOND(cx, cy - 8), class: "beyond" }, svg("title", {}, p.label)) : null;
+    picture.append(...(p.href ? [linked(p.href, p.label, mark, beyond)] : [mark, beyond]).filter(Boolean));
   }
   return picture;
+}
+
+const APART_PX = 64;
+
+/** The limit that each point had, and where it became another one, with the new one. */
+function drawLimits(picture, own, { x, y, top, bottom, right }) {
+  const half = (i) => (i === 0 ? LEFT : i === own.length ? right : (x(i - 1) + x(i)) / 2);
+  let labelled = -APART_PX;
+  for (let start = 0, end; start < own.length; start = end) {
+    const limit = own[start];
+    for (end = start + 1; end < own.length && own[end] === limit; ) end += 1;
+    if (limit !== null) picture.append(svg("line", { x1: half(start), x2: half(end), y1: y(limit), y2: y(limit), class: "spec" }));
+    if (start === 0) continue;
+    const at = half(start);
+    picture.append(svg("line", { x1: at, x2: at, y1: top - 8, y2: bottom, class: "change" }));
+    if (at - labelled < APART_PX) continue;
+    labelled = at;
+    const left = at > right - APART_PX * 2;
+    picture.append(svg("text", { x: at + (left ? -5 : 5), y: top - 6, class: "change", "text-anchor": left ? "end" : "start" },
+      `${limit === null ? "–" : figure(limit, 4)}`));
+  }
 }
 
 const MARKS = {
@@ -81,8 +108,10 @@ const MARKS = {
   run: (x, y) => `M${x} ${y - 7}l7 7l-7 7l-7-7Z`,
 };
 
-function linked(href, label, mark) {
-  return svg("a", { href, "aria-label": label, tabindex: "-1" }, mark);
+const BEYOND = (x, y) => `M${x} ${y - 10}l6.5 10h-13Z`;
+
+function linked(href, label, ...marks) {
+  return svg("a", { href, "aria-label": label, tabindex: "-1" }, marks);
 }
 
 const pathOf = (points) => points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");

@@ -42,24 +42,49 @@ function ppk(c) {
   return `${figure(c.ppk, 3)} (${figure(low, 3)}–${figure(high, 3)})`;
 }
 
+/** The limit, with a sign where it was another one for some of the units. */
+function limitOf(c, told) {
+  if (!c.limits_changed) return told(c.high);
+  return element("span", { title: word("quality.limits_changed") }, `${told(c.high)} ⇅`);
+}
+
+function outsideOf({ outside }) {
+  if (outside === null) return "–";
+  return outside ? element("span", { class: "outside" }, `▲ ${outside}`) : "0";
+}
+
+/** What the limits say of a characteristic, in words. */
+function limitsTold(c) {
+  if (c.high === null && !c.limits_changed) return [];
+  const told = [];
+  if (c.outside !== null) {
+    const given = { outside: c.outside, n: c.n, limit: amount(c.name, c.unit, c.high) };
+    told.push(element("p", { class: `beside${c.outside ? " outside" : ""}`, "data-outside": c.outside },
+      `${c.outside ? "▲ " : ""}${word("quality.outside_told", given)}`));
+  }
+  if (c.limits_changed) told.push(element("p", { class: "beside changed" }, `⇅ ${word("quality.limits_changed")}`));
+  return told;
+}
+
 function characteristics(list, pick) {
   const heads = [["quality.characteristic"], ["quality.n", "n"], ["quality.mean", "n"], ["quality.sd", "n"], ["quality.low", "n"],
-    ["quality.high", "n"], ["quality.ppk", "n"]];
+    ["quality.high", "n"], ["quality.outside", "n"], ["quality.ppk", "n"]];
   return element("section", { class: "panel" }, element("h2", {}, word("quality.characteristics")),
     element("div", { class: "wide" }, element("table", { class: "stack" },
       element("thead", {}, element("tr", {}, heads.map(([key, kind]) => element("th", { scope: "col", class: kind }, word(key))))),
       element("tbody", {}, list.map((c) => {
         const told = (value, digits) => amount(c.name, c.unit, value, digits);
-        const cells = [String(c.n), told(c.mean), told(c.sd, 3), told(c.low), told(c.high), ppk(c)];
+        const cells = [String(c.n), told(c.mean), told(c.sd, 3), told(c.low), limitOf(c, told), outsideOf(c), ppk(c)];
         return element("tr", {},
           element("th", { scope: "row" }, element("button", { type: "button", class: "link name", onclick: () => pick(c.name) }, characteristicName(c.name))),
           cells.map((cell, i) => element("td", { class: "n", "data-label": word(heads[i + 1][0]) }, cell)));
       })))));
 }
 
-/** Individuals and moving ranges of a characteristic: a `triaxcal.chart/1`. */
-function charts({ name, unit: given, points, centre, low, high, mr_mean, mr_high, limit }) {
-  if (points.length < 2) return [element("p", { class: "muted" }, word("quality.few"))];
+/** Individuals and moving ranges of a characteristic: a `triaxcal.chart/1`, and before
+ * them what `c` of `triaxcal.quality/1` says of its limits. */
+function charts(c, { name, unit: given, points, centre, low, high, mr_mean, mr_high, limit }) {
+  if (points.length < 2) return [...limitsTold(c), element("p", { class: "muted" }, word("quality.few"))];
   const { factor, unit } = scaleOf(name, given);
   const scaled = (value) => (value === null ? null : value * factor);
   const title = (kind) => `${characteristicName(name)}${unit ? `, ${unit}` : ""}: ${word(kind)}`;
@@ -68,17 +93,21 @@ function charts({ name, unit: given, points, centre, low, high, mr_mean, mr_high
     value: scaled(value), mark, href: `/runs/${encodeURIComponent(point.run)}`,
     label: [point.serial, timeOf(point.time), amount(name, given, value, 5)].filter(Boolean).join(", "),
   });
+  const limited = points.some((point) => point.limit !== null);
   const ruled = ({ outside }) => (outside === "limits" ? "outside" : outside);
   return [
+    ...limitsTold(c),
     fitted(title("quality.individuals"), (at) => controlChart({
-      ...at, lines: lines({ centre: [centre], control: [low, high], spec: [limit] }),
-      points: points.map((point) => marked(point, point.value, ruled(point))),
+      ...at, lines: lines({ centre: [centre], control: [low, high] }), limits: limited,
+      points: points.map((point) => ({
+        ...marked(point, point.value, ruled(point)), limit: scaled(point.limit), beyond: limit !== null && point.value > limit,
+      })),
     })),
     fitted(title("quality.moving_range"), (at) => controlChart({
       ...at, lines: lines({ centre: [mr_mean], control: [mr_high] }), height: 180,
       points: points.map((point) => marked(point, point.moving_range, point.moving_range_outside ? "outside" : null)),
     })),
-    element("p", { class: "muted" }, word("quality.chart_note")),
+    element("p", { class: "muted" }, [word("quality.chart_note"), limited ? word("quality.chart_note_limit") : ""].join(" ").trim()),
   ];
 }
 
@@ -93,7 +122,7 @@ try {
       const name = choice.value;
       let drawn;
       try {
-        drawn = charts(await ask(`/api/1/charts?${asked(["name", name])}`));
+        drawn = charts(list.find((c) => c.name === name), await ask(`/api/1/charts?${asked(["name", name])}`));
       } catch (error) {
         drawn = [failure(error)];
       }

@@ -31,16 +31,18 @@ export function asked(...more) {
   return query;
 }
 
-/** Runs as rows; `whole` also shows the serial number. */
-export function runsTable(runs, { whole = true } = {}) {
+/** Runs as rows: of several units, or the history of one, which also has the reasons in
+ * full. */
+export function runsTable(runs, { history = false } = {}) {
   const columns = [
     ["runs.ended", (r) => runLink(r.run, timeOf(r.ended)), "time"],
-    whole ? ["card.serial", (r) => unitLink(r.serial ?? r.work_serial)] : null,
+    history ? null : ["card.serial", (r) => unitLink(r.serial ?? r.work_serial)],
     ["runs.verdict", (r) => verdictTag(r.verdict)],
-    ["runs.code", (r) => (r.code ? element("span", { title: r.reason }, meaning(r.code)) : r.reason), "text"],
+    ["runs.code", (r) => why(r, history), "text"],
     ["runs.error", (r) => errorOf(r), "n"],
     ["card.slot", (r) => r.slot ?? r.unit],
     ["runs.attempt", (r) => r.attempt ?? "–", "n"],
+    history ? ["work.reason", (r) => r.work_reason ?? "–", "text"] : null,
     ["work.order", (r) => r.order ?? "–"],
     ["work.part_number", (r) => r.part_number ?? "–"],
     ["work.fixture", (r) => r.fixture ?? "–"],
@@ -51,6 +53,12 @@ export function runsTable(runs, { whole = true } = {}) {
       element("thead", {}, element("tr", {}, columns.map(([key, , kind]) => element("th", { scope: "col", class: kind }, word(key))))),
       element("tbody", {}, runs.map((run) =>
         element("tr", {}, columns.map(([key, cell, kind]) => element("td", { class: kind, "data-label": word(key) }, cell(run))))))));
+}
+
+function why({ code, reason }, history) {
+  if (!code) return reason;
+  if (!history || code === "within_limits") return element("span", { title: reason }, meaning(code));
+  return element("div", {}, meaning(code), element("small", { class: "detail" }, reason));
 }
 
 function errorOf(run) {

@@ -10,7 +10,7 @@ import { COEFFICIENTS } from "./results.js";
 const content = document.getElementById("content");
 const address = `/api/1/runs/${encodeURIComponent(page.run)}`;
 
-const panel = (title, ...children) => element("section", { class: "panel" }, element("h2", {}, title), ...children);
+const panel = (title, ...children) => element("section", { class: "panel" }, element("h2", {}, title), children);
 
 function banner(run) {
   return element("div", { class: `banner ${run.verdict}` },
@@ -32,6 +32,7 @@ function facts(run) {
     ["work.reason", run.work_reason],
     ["run.started", timeOf(run.started)],
     ["run.duration", duration],
+    ["run.settles", run.settles ? runLink(run.settles, word("run.settles_link")) : null],
     ["run.device_state", wordOr(`device.${run.device_state}`, run.device_state)],
     ["card.poses", run.poses],
   ].filter(([, value]) => value !== null && value !== undefined);
@@ -41,11 +42,14 @@ function facts(run) {
 
 function papers(run) {
   const link = (key, path, attributes = {}) => element("a", { class: "button", href: `${address}/${path}`, ...attributes }, word(key));
+  const lacking = [["report", "run.report"], ["certificate", "run.certificate"], ["recording", "run.recording"]]
+    .filter(([name]) => !run[name]).map(([, key]) => word(key));
   return panel(word("run.papers"), element("div", { class: "papers" },
     run.report ? link("run.report", "report", { target: "_blank" }) : null,
     run.certificate ? link("run.certificate", "certificate", { download: true }) : null,
     link("run.outcome", "outcome", { target: "_blank" }),
-    run.recording ? link("run.recording", "recording", { download: true }) : null));
+    run.recording ? link("run.recording", "recording", { download: true }) : null),
+  lacking.length ? element("p", { class: "muted lacking" }, word("run.lacking", { names: lacking.join(", ") })) : null);
 }
 
 function errors(run) {
@@ -71,6 +75,10 @@ function coefficients(run) {
       element("td", { class: "n" }, scaleOf(name, unit).unit || "–")));
   if (!rows.length) return null;
   return panel(word("run.coefficients"), table(["run.quantity", "run.value", "run.standard_error", "run.unit"], rows));
+}
+
+function beside(...panels) {
+  return panels.some(Boolean) ? element("div", { class: "two" }, panels) : null;
 }
 
 function errorOf(run, name, unit) {
@@ -111,7 +119,7 @@ function events(list) {
     list.map((event) => element("tr", {}, element("td", { class: "time" }, clockOf(event.time)), element("td", {}, told(event)))))));
 }
 
-async function trace(place) {
+async function trace(place, recording) {
   try {
     const found = await ask(`/runs/${encodeURIComponent(page.run)}/trace`, { patience_ms: 60000 });
     place.replaceChildren(
@@ -119,7 +127,7 @@ async function trace(place) {
       element("p", { class: "muted" }, word("run.trace_note")));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    place.replaceChildren(element("p", { class: "muted" }, word("run.no_trace")));
+    place.replaceChildren(element("p", { class: "muted" }, word(recording ? "run.short_trace" : "run.no_trace")));
   }
 }
 
@@ -130,12 +138,11 @@ try {
   const picture = element("div", {}, element("p", { class: "muted" }, word("page.loading")));
   content.replaceChildren(...[
     element("h1", {}, word("run.title", { serial })), banner(run), facts(run), papers(run),
-    element("div", { class: "two" }, errors(run), coefficients(run)),
+    beside(errors(run), coefficients(run)),
     element("section", { class: "panel", "aria-label": word("run.trace") }, picture), panel(word("run.events"), events(run.events ?? [])),
-    run.settles ? element("p", {}, runLink(run.settles, run.settles)) : null,
   ].filter(Boolean));
   content.removeAttribute("aria-busy");
-  await trace(picture);
+  await trace(picture, run.recording);
 } catch (error) {
   content.replaceChildren(failure(error));
   content.removeAttribute("aria-busy");

@@ -31,16 +31,38 @@ function tasksOf(now) {
   if (page.operator && !now.operator) return [{ title: word("task.badge"), more: word("task.badge_more"), scan: true }, ...blockedTask(now)];
   const empty = slots.filter((s) => s.state === "empty");
   const filled = slots.length - empty.length;
-  const task = !filled
+  const chosen = slots.find((s) => s.slot === now.chosen);
+  const task = chosen
+    ? { title: word("task.scan_chosen", { slot: chosen.slot }), more: chosenMore(chosen), scan: true }
+    : !filled
     ? { title: word("task.scan_first"), more: word("task.scan_first_more", { slot: slots[0]?.slot ?? "" }), scan: true }
     : empty.length
       ? { title: word("task.scan_next"), more: word("task.scan_next_more", { filled, slots: slots.length, slot: empty[0].slot }), scan: true }
       : { title: word("task.start"), more: word("task.start_more") };
-  return [...blockedTask(now), task];
+  // A tray whose start is refused is not to be started.
+  const refused = now.blocked && !chosen && filled > 0 && !empty.length;
+  return [...blockedTask(now), ...(refused ? [] : [task])];
 }
+
+function chosenMore({ slot, serial }) {
+  const replaced = serial ? word("task.scan_chosen_replaces", { serial: whole(serial) }) : "";
+  return [word("task.scan_chosen_more", { slot }), replaced].filter(Boolean).join(" ");
+}
+
+/** A serial number that no line break parts. */
+const whole = (serial) => serial.replaceAll("-", "\u2011").replaceAll(" ", "\u00a0");
+
+/** Whether the code is of a slot that waits for the golden unit. */
+const ofGolden = (code) => page.golden !== null && ["golden_due", "golden_failed"].includes(code);
 
 function blockedTask(now) {
   if (!now.blocked) return [];
+  const these = now.slots.filter((s) => s.blocked).map((s) => s.slot);
+  if (ofGolden(now.blocked) && these.length) {
+    const more = [word("task.golden_more", { serial: whole(page.golden), slot: these[0] })];
+    if (these.length > 1) more.push(word("task.golden_each", { slots: these.join(", ") }));
+    return [{ title: word("task.golden"), more: more.join(" "), tone: "warn" }];
+  }
   const more = [wordOr(`problem.${now.blocked}`, now.blocked), wordOr(`problem.${now.blocked}_do`, "")].join(" ");
   return [{ title: word("task.blocked"), more, tone: "warn" }];
 }
@@ -156,10 +178,11 @@ function cardOf(slot) {
 function showCards(now) {
   const nodes = now.slots.map((slot) => {
     const card = cardOf(slot.slot);
-    const shown = JSON.stringify(slot);
+    const chosen = slot.slot === now.chosen;
+    const shown = JSON.stringify([slot, chosen]);
     if (shown !== card.shown) {
       card.shown = shown;
-      showCard(card.node, slot);
+      showCard(card.node, slot, chosen);
     }
     return card.node;
   });
@@ -171,9 +194,18 @@ function showCards(now) {
 /** Whether each unit has a pose of its own to take: several, and no fixture. */
 const turnedAlone = () => !page.together && page.slots.length > 1;
 
-function showCard(node, slot) {
+/** Why the slot does not start, and what to do. */
+function blockedNote({ blocked }) {
+  const golden = ofGolden(blocked);
+  const why = wordOr(`problem.${blocked}`, meaning(blocked));
+  const advice = golden ? word("card.golden_do", { serial: whole(page.golden) }) : wordOr(`problem.${blocked}_do`, "");
+  return element("div", { class: "blocked-note", "data-code": blocked }, 
+    element("p", { class: "stage" }, word("card.blocked")), element("strong", {}, why), element("p", {}, advice));
+}
+
+function showCard(node, slot, chosen) {
   const verdict = VERDICTS[slot.state];
-  node.className = `card ${slot.state}`;
+  node.className = ["card", slot.state, chosen ? "chosen" : "", slot.blocked ? "blocked" : ""].filter(Boolean).join(" ");
   const head = element("header", {},
     element("span", { class: "slot" }, slot.slot),
     element("span", { class: "serial" }, slot.serial ?? ""),
@@ -189,8 +221,10 @@ function showCard(node, slot) {
     return;
   }
   const body = element("div", { class: "body" });
-  const told = element("div", { class: "told" },
-    element("p", { class: "stage" }, slot.stage && slot.state === "running" ? wordOr(`stage.${slot.stage}`, slot.stage) : word(`state.${slot.state}`)));
+  const told = element("div", { class: "told" });
+  if (slot.blocked) told.append(blockedNote(slot));
+  else told.append(element("p", { class: "stage" }, slot.stage && slot.state === "running" ? wordOr(`stage.${slot.stage}`, slot.stage) : word(`state.${slot.state}`)));
+  if (chosen) told.prepend(element("p", { class: "chosen-note" }, word("card.chosen")));
   if (slot.state === "lost") told.append(element("p", { class: "why" }, slot.code ? meaning(slot.code) : ""), element("p", { class: "detail" }, slot.reason ?? ""));
   if (atWork(slot) && COLLECTING.includes(slot.stage)) {
     const key = slot.stage === "poses" ? "card.pose" : "card.check_pose";
@@ -388,7 +422,7 @@ function showButtons() {
   const working = slots.some(atWork);
   at("start").disabled = silent || state === null || working;
   at("stop").disabled = silent || !working;
-  at("clear").disabled = silent || working || slots.every((s) => s.state === "empty");
+  at("clear").disabled = silent || working || (slots.every((s) => s.state === "empty") && !state?.chosen);
 }
 
 // A scanner types: fast, and Enter at the end. Keys go to the field from anywhere on

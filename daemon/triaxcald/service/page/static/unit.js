@@ -31,7 +31,7 @@ try {
       .map((name) => ({ name, unit: "g", title: word(`figure.${name}`), limit: name.replace(/_g$/, "_limit_g") }));
     const charts = [...errors, ...COEFFICIENTS].map((what) => overRuns([...newest].reverse(), what)).filter(Boolean);
     content.replaceChildren(
-      element("h2", {}, word("unit.history")), runsTable(newest, { whole: false }),
+      element("h2", {}, word("unit.history")), runsTable(newest, { history: true }),
       element("h2", {}, word("unit.over_runs")),
       charts.length ? element("div", { class: "two" }, charts.map((chart) => element("div", { class: "panel" }, chart)))
         : element("p", { class: "muted" }, word("unit.short")));
