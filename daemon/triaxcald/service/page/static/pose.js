@@ -79,7 +79,8 @@ const TOWARDS = { face: "pose.towards_face", edge: "pose.towards_edge", corner: 
 /** A direction in the reader's language: the pose, and the tilt or null. */
 export function describedPose(up, faces) {
   const parts = partsOf(up);
-  const named = (axes) => axes.map((a) => faces[a]).join("/");
+  // A minus sign, since a line may break behind a hyphen.
+  const named = (axes) => axes.map((a) => faces[a].replace(/^-/, "−")).join("/");
   return {
     pose: word(UP[KINDS[parts.axes.length]], { name: named(parts.axes) }),
     tilt: parts.towards
