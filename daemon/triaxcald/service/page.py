@@ -153,6 +153,7 @@ def _rendered(
         "faces": file.fixture.names,
         "together": file.fixture.together,
         "operator": file.rules.operator,
+        "person": who.name if who is not None and who.by == "cookie" else None,
         "golden": None if file.rules.golden is None else file.rules.golden.serial,
         **given,
     }

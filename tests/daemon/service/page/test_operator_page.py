@@ -24,20 +24,6 @@ def scan(page: Page, *texts: str) -> None:
         page.keyboard.press("Enter")
 
 
-def burst(page: Page, text: str) -> None:
-    """The same without a pause that a busy computer might make between two keys."""
-    page.evaluate(
-        """text => {
-          const field = document.activeElement;
-          for (const key of [...text, "Enter"]) {
-            field.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
-            if (key !== "Enter") field.value += key;
-          }
-        }""",
-        text,
-    )
-
-
 def task(page: Page) -> str:
     return page.locator("#task-title").inner_text()
 
@@ -144,6 +130,45 @@ def test_stopping_the_tray_can_be_taken_back(stage: Stage, opened: Opened) -> No
     assert {unit.reason for unit in stage.floor.played.units.values()} == {"stopped"}
 
 
+@pytest.mark.parametrize("pause_ms", [4, 60, 150])
+def test_a_scanner_does_not_answer_whether_to_stop(stage: Stage, opened: Opened, pause_ms: int) -> None:
+    in_poses(stage)
+    page = opened()
+    page.locator("#stop").click()
+    page.keyboard.type("SN-9", delay=pause_ms)
+    page.keyboard.press("Enter")
+    expect(page.locator("#stop-reason")).to_have_value("SN-9")
+    expect(page.locator("#stop-dialog")).to_be_visible()
+    assert stage.floor.played is not None
+    assert {unit.reason for unit in stage.floor.played.units.values()} == {None}
+    assert {slot.serial for slot in stage.floor.desk.slots.values()} == set(SERIALS)
+
+
+def test_a_question_about_a_slot_ends_with_its_run_and_one_about_the_tray_with_the_tray(
+    stage: Stage, opened: Opened
+) -> None:
+    in_poses(stage)
+    page, other = opened(), opened()
+    page.locator("#stop").click()
+    other.get_by_role("button", name="Stop slot a").click()
+    stage.finish("a")
+    expect(other.locator("#stop-dialog")).to_be_hidden()
+    expect(page.locator("#stop-dialog")).to_be_visible()
+    for slot in "bcd":
+        stage.finish(slot)
+    expect(page.locator("#stop-dialog")).to_be_hidden()
+    expect(page.locator(".card.passed")).to_have_count(4)
+
+
+def test_a_tray_that_has_its_verdicts_is_not_started_again_before_a_scan(stage: Stage, opened: Opened) -> None:
+    ended(stage)
+    page = opened()
+    expect(page.locator(".card.passed")).to_have_count(1)
+    expect(page.locator("#start")).to_be_disabled()
+    scan(page, "SN-9")
+    expect(page.locator("#start")).to_be_enabled()
+
+
 @pytest.mark.parametrize("language", ["en", "de", "uk"])
 def test_an_error_is_said_in_words_with_what_to_do(stage: Stage, opened: Opened, language: str) -> None:
     page = opened(f"/?lang={language}")
@@ -176,12 +201,14 @@ def test_a_missing_reason_is_asked_for_and_starts_the_tray(stage: Stage, opened:
     dialog = page.locator("#retest-dialog")
     expect(dialog).to_be_visible()
     expect(page.locator("#retest-reason")).to_be_focused()
-    burst(page, "WO:4712")  # a scan while it is asked is a scan
-    expect(page.locator("#work")).to_contain_text("4712")
-    expect(page.locator("#retest-reason")).to_have_value("")
-    page.locator("#retest-reason").press_sequentially("customer return", delay=90)
+    page.keyboard.type("WO:4712")  # a scan while it is asked is neither an order nor an answer
     page.keyboard.press("Enter")
+    expect(page.locator("#retest-reason")).to_have_value("WO:4712")
+    expect(dialog).to_be_visible()
+    page.locator("#retest-reason").fill("customer return")
+    dialog.locator("button[value=start]").click()
     expect(page.locator(".card.running")).to_have_count(1)
+    expect(page.locator("#work")).not_to_contain_text("4712")
     expect(page.locator("#work")).to_contain_text("customer return")
     expect(dialog).to_be_hidden()
     assert stage.floor.starts == 1

@@ -250,12 +250,13 @@ def test_an_operator_signs_in_works_and_signs_out(guarded: Stage, browser: Brows
     expect(page.locator("#error")).to_contain_text("Nobody is signed in.")
     page.locator("#error").get_by_role("link", name="Sign in").click()
     for pin in ("1234", PIN):
-        page.get_by_label("Name").fill("olena")
+        page.get_by_label("Name").fill("OP:olena")  # as a badge is scanned
         page.get_by_label("PIN").fill(pin)
         page.keyboard.press("Enter")
         if pin != PIN:
             expect(page.get_by_role("alert")).to_contain_text("wrong")
-    expect(page.locator("#task-title")).to_have_text("Scan your badge")
+    expect(page.locator("#work")).to_contain_text("olena")  # needs no badge
+    expect(page.locator("#task-title")).to_have_text("Scan a unit")
     page.keyboard.type("SN-1")
     page.keyboard.press("Enter")
     expect(page.locator(".card.scanned")).to_have_count(1)

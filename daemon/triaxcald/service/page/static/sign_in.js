@@ -12,7 +12,8 @@ form.addEventListener("submit", async (e) => {
   button.disabled = true;
   error.hidden = true;
   try {
-    await ask("/api/1/session", { method: "POST", body: { name: name.value, pin: pin.value } });
+    const scanned = name.value.trim().replace(/^OP:/i, ""); // a badge
+    await ask("/api/1/session", { method: "POST", body: { name: scanned, pin: pin.value } });
     location.assign(page.next);
   } catch (e) {
     if (!(e instanceof Refused)) throw e;

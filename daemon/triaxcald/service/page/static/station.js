@@ -11,6 +11,9 @@ const COLLECTING = ["poses", "check_poses"];
 let state = null;
 let live = {};
 
+// Who works: whose badge was scanned, else who has signed in here.
+const operatorOf = (now) => now.operator ?? page.person;
+
 // What to do.
 
 /** The tasks at hand, the most urgent first: `title`, and `more`, `slots`, `up`,
@@ -28,7 +31,7 @@ function tasksOf(now) {
       .map(([n, verdict]) => `${n} ${word(`verdict.${verdict}`)}`.replaceAll(" ", "\u00a0"));
     return [...blockedTask(now), { title: word("task.done"), more: `${counted.join(", ")}. ${word("task.done_more")}` }];
   }
-  if (page.operator && !now.operator) return [{ title: word("task.badge"), more: word("task.badge_more"), scan: true }, ...blockedTask(now)];
+  if (page.operator && !operatorOf(now)) return [{ title: word("task.badge"), more: word("task.badge_more"), scan: true }, ...blockedTask(now)];
   const empty = slots.filter((s) => s.state === "empty");
   const filled = slots.length - empty.length;
   const chosen = slots.find((s) => s.slot === now.chosen);
@@ -296,7 +299,7 @@ function announce(now, before) {
 }
 
 function showWork(now) {
-  const given = { ...now.work, operator: now.operator };
+  const given = { ...now.work, operator: operatorOf(now) };
   const shown = ["operator", "order", "part_number", "batch", "fixture", "reason"].filter((key) => given[key]);
   at("work").replaceChildren(...shown.map((key) => element("div", {}, element("dt", {}, word(`work.${key}`)), element("dd", {}, given[key]))));
 }
@@ -388,6 +391,7 @@ function askToStop(slot) {
   const field = at("stop-reason");
   field.value = "";
   dialog.returnValue = "";
+  dialog.dataset.slot = slot ?? "";
   at("stop-title").textContent = slot === null ? word("command.stop_tray_title") : word("command.stop_slot_title", { slot });
   dialog.onclose = () => {
     if (dialog.returnValue !== "stop") return;
@@ -399,6 +403,19 @@ function askToStop(slot) {
     });
   };
   if (!dialog.open) dialog.showModal();
+}
+
+/** A question about a tray ends with it: its answer would be taken for the next one. */
+function closeAnswered(now, before) {
+  const other = before !== null && before.tray !== now.tray;
+  const { slot } = at("stop-dialog").dataset;
+  const working = now.slots.filter(atWork);
+  if (other || !working.some((s) => !slot || s.slot === slot)) closed(at("stop-dialog"));
+  if (other || working.length) closed(at("retest-dialog"));
+}
+
+function closed(dialog) {
+  if (dialog.open) dialog.close("");
 }
 
 at("command").addEventListener("submit", (e) => {
@@ -420,14 +437,16 @@ at("kind").addEventListener("change", () => at("text").focus());
 function showButtons() {
   const slots = state?.slots ?? [];
   const working = slots.some(atWork);
-  at("start").disabled = silent || state === null || working;
+  const again = slots.some((s) => s.state in VERDICTS) && !slots.some((s) => s.state === "scanned");
+  at("start").disabled = silent || state === null || working || again;
   at("stop").disabled = silent || !working;
   at("clear").disabled = silent || working || (slots.every((s) => s.state === "empty") && !state?.chosen);
 }
 
 // A scanner types: fast, and Enter at the end. Keys go to the field from anywhere on
-// the page. In another field or a dialog, fast characters are taken for a scan, and
-// taken out of it again.
+// the page. In another field, fast characters are taken for a scan, and taken out of
+// it again. A dialog keeps what is typed, and only its buttons answer it: the Enter of
+// a scanner, quick or slow, neither stops a tray nor takes a unit behind the dialog.
 
 const FAST_MS = 60;
 const SCAN_LEAST = 4;
@@ -443,6 +462,10 @@ function typed(e) {
   if (e.key === "Enter") {
     const scanned = fast && burst.length >= SCAN_LEAST && e.target === last_target ? burst : "";
     burst = "";
+    if (document.querySelector("dialog[open]")) {
+      if (field || scanned) e.preventDefault();
+      return;
+    }
     if (!scanned || field === at("text")) return;
     e.preventDefault();
     e.stopPropagation();
@@ -476,6 +499,7 @@ new Following({
     state = now;
     if (before?.tray !== now.tray) request = null;
     for (const slot of now.slots) if (!COLLECTING.includes(slot.stage)) delete live[slot.slot];
+    closeAnswered(now, before);
     showWork(now);
     showCards(now);
     showTask(tasksOf(now));
