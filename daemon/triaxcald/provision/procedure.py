@@ -197,6 +197,8 @@ class Provisioning:
     """Whether the journal is there for a probe alone."""
     _earlier: list[Journal] = field(default_factory=list)
     """Journals of this unit that earlier provisionings left, the newest first."""
+    _removed: list[Journal] = field(default_factory=list)
+    """Those of them that are gone since the device is settled."""
     _unlocked: bool = False
     _store_asked: bool = False
     _decided: bool = False
@@ -224,7 +226,8 @@ class Provisioning:
     def settles(self) -> str | None:
         """The id of the run whose journal this provisioning has removed, or would;
         None if there was none."""
-        return next((entry.run for journal, entry in self._journals if entry.run), None)
+        runs = {journal: entry.run for journal, entry in self._journals}
+        return next((run for journal in self._removed or self._earlier if (run := runs.get(journal))), None)
 
     @property
     def resets(self) -> bool:
@@ -377,7 +380,7 @@ class Provisioning:
             journals = journals_of(self.folder, self.owner, self.bundle.profile)
             mine = [(j, e) for j, e in journals if j.path == self.source or (e.serial and e.before == snapshot.raw)]
             self._earlier = list(dict.fromkeys([*(j for j, _ in mine), *self._named_for_it(journals)]))
-            self._journals = mine
+            self._journals = journals
             if mine:  # the wanted image is known: a device that holds it is not in a mixed state
                 self.image = image_of(self.bundle.profile, mine[0][1].wanted)
         if self.differing and not self._earlier:
@@ -435,6 +438,7 @@ class Provisioning:
             self.on_settled(self.held)
             for journal in (*self._earlier, *([self.journal] if self._journaled else [])):
                 journal.remove()
+            self._removed = self._removed or self._earlier
             self._earlier, self._journaled, self._probing = [], False, False
         elif self._probing and not self.link.touched & set(self.before.raw):  # the probe is gone
             self.journal.remove()

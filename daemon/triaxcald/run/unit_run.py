@@ -143,6 +143,7 @@ class UnitRun(UnitSession):
         self._answered = False
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
+        self._unreadable_journal = False
         self._recording: Path | None = None
         self._artifacts: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
@@ -328,7 +329,8 @@ class UnitRun(UnitSession):
     def _held(self) -> Held:
         if self._provisioning:
             return self._provisioning.held
-        return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER) if self._open_journal else Held()
+        cut_short = self._open_journal or self._unreadable_journal
+        return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER) if cut_short else Held()
 
     def _finalize(self, writer: RecordingWriter, ending: Ending) -> None:
         """Store the outcome as the last attachment, with the inventory of everything
@@ -439,7 +441,7 @@ class UnitRun(UnitSession):
         try:
             journals_of(self.station.folder, Owner.of(self.profile, self.name, identity.serial), self.profile)
         except InputError:
-            self._open_journal = None  # no command can use it
+            self._open_journal, self._unreadable_journal = None, True  # no command can use it
             raise
 
     async def _require_readings_before(self, device: td.Device) -> None:

@@ -261,4 +261,8 @@ def test_a_journal_that_cannot_be_read_is_named_and_nothing_written(
         triaxcal("provision", "--resume", bench.station).failed(2, str(journal), said)
         triaxcal("restore", journal, bench.station).failed(2, str(journal), said)
         bench.provision().failed(2, str(journal), said)
+        done = triaxcal("run", bench.station, "--events")
+        assert done.code == 2
+        (outcome,) = (e["outcome"] for e in map(json.loads, done.out.splitlines()) if e["event"] == "ended")
+        assert outcome["device_state"] == "unknown"  # something may have been written
         assert bench.unit.written == []

@@ -17,6 +17,7 @@ from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.profile import Profile
 from triaxcald.errors import DiskError, InputError
 from triaxcald.provision.journal import Entry, Journal, Owner, journals_of, open_journal, parse
+from triaxcald.provision.registers import Snapshot, image_of
 from triaxcald.run.provision_by_hand import unit_in
 from triaxcald.software import new_run_id
 
@@ -143,6 +144,28 @@ async def test_an_old_journal_of_the_unit_is_finished_and_goes(tmp_path: Path) -
     assert await host.resume()
     assert host.starts_with() == "new"
     assert host.journals == []
+
+
+async def put_back(host: Host, registers: dict[str, bytes]) -> None:
+    """Another calibration than the journal's, as from a certificate."""
+    p = host.provisioning = host._begun(image_of(host.bundle.profile, registers))
+    await host._finished(p.put_back(Snapshot(registers, "4711")))
+
+
+@pytest.mark.parametrize("way", ["resume", "restore", "another"])
+async def test_the_run_that_is_settled_is_the_one_whose_journal_goes(tmp_path: Path, way: str) -> None:
+    host = Host(tmp_path, Habits())
+    assert not await host.provision(kill_at=30)
+    (path,) = host.journals
+    path.write_text(json.dumps({**json.loads(path.read_text()), "run": "the cut run"}))
+    if way == "another":
+        registers = replace(OLD, bias=(0.031, 0.002, -0.004)).image(HABITS)
+        assert await host._process(put_back(host, registers), None, False)
+    else:
+        assert await getattr(host, way)()
+    assert host.journals == []
+    assert host.provisioning is not None
+    assert host.provisioning.settles == "the cut run"
 
 
 def test_file_and_folder_are_on_the_disk_when_it_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
