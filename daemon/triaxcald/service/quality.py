@@ -172,7 +172,7 @@ def _characteristic(name: str, attempts: _Attempts) -> dict[str, Any] | None:
         return None
     limits = [_limit(name, row) for row in measured]
     high, n = limits[-1], len(values)
-    mean, sd = float(values.mean()), float(values.std(ddof=1)) if n > 1 else None
+    mean, sd = _mean(values), float((values - values[0]).std(ddof=1)) if n > 1 else None
     ppk = None if high is None or not sd or n < PPK_LEAST else (high - mean) / (3 * sd)
     return {
         "name": name,
@@ -187,6 +187,11 @@ def _characteristic(name: str, attempts: _Attempts) -> dict[str, Any] | None:
         "ppk": tc.rounding.number(ppk, 4),
         "ppk_interval": None if ppk is None else _rounded(one_sided_interval(ppk, n)),
     }
+
+
+def _mean(values: Floats) -> float:
+    """Exact for equal values: rounding of their sum would pass for a scatter."""
+    return float(values[0] + (values - values[0]).mean())
 
 
 def _share(passed: Sequence[bool]) -> float | None:
@@ -269,7 +274,7 @@ def individuals(values: Sequence[float] | Floats) -> Individuals:
         centre = float(x[0]) if len(x) else None
         return Individuals(x, np.empty(0), centre, None, None, None, None, (None,) * len(x))
     ranges = np.abs(np.diff(x))
-    centre, mean = float(x.mean()), float(ranges.mean())
+    centre, mean = _mean(x), float(ranges.mean())
     low, high = centre - INDIVIDUALS * mean, centre + INDIVIDUALS * mean
     beyond = (x < low) | (x > high)
     outside: list[str | None] = []

@@ -170,6 +170,16 @@ def test_ppk_is_not_stated_for_few_units_equal_values_or_without_a_limit() -> No
         assert (found["ppk"], found["ppk_interval"]) == (None, None)
 
 
+@pytest.mark.parametrize("value", [3e-5, 3.3e-5, 5e-5, 0.1, 1.0015])
+@pytest.mark.parametrize("n", [30, 40, 77])
+def test_equal_values_have_no_scatter_whatever_their_decimals(value: float, n: int) -> None:
+    found = by_name(measured([value] * n))["rms_g"]
+    assert (found["mean"], found["sd"], found["ppk"]) == (value, 0.0, None)
+    chart = individuals([value] * n)
+    assert (chart.centre, chart.low, chart.high) == (value, value, value)
+    assert set(chart.outside) == {None}
+
+
 TOLERANCE_FACTORS = [
     (10, 0.95, 2.911), (10, 0.99, 3.981), (30, 0.95, 2.220), (30, 0.99, 3.064), (50, 0.95, 2.065), (50, 0.99, 2.862),
     (100, 0.95, 1.927), (100, 0.99, 2.684),

@@ -155,7 +155,9 @@ def test_quality_shows_yield_reasons_and_charts(runs: list[dict[str, Any]], open
     expect(figures).to_have_count(4)
     attempts = page.locator(".figures div", has_text="Attempts").locator("dd")
     expect(attempts).to_have_text(str(RUNS))
-    expect(page.locator(".figures div", has_text="First-pass yield").locator("small")).to_contain_text("95 %:")
+    expect(page.locator(".figures div", has_text="First-pass yield").locator("small")).to_contain_text(
+        re.compile(r"\d+ of \d+; 95 %:")
+    )
     bars = page.locator(".pareto tbody tr")
     expect(bars).to_have_count(len(set(FAILED.values())))
     first = bars.first
@@ -170,6 +172,10 @@ def test_quality_shows_yield_reasons_and_charts(runs: list[dict[str, Any]], open
     expect(charts.nth(0).locator(".point.outside")).to_have_count(3)  # a unit's last run counts, and RETESTED passed
     expect(charts.nth(0).locator(".spec")).to_have_count(1)
     expect(charts.nth(0).locator(".control")).to_have_count(2)
+    numbers = re.compile(
+        r"Mean [\d.]+ µg; control limits (?:–|[\d.]+ µg) and [\d.]+ µg .*mean [\d.]+ µg, limit [\d.]+ µg"
+    )
+    expect(page.locator("p.control-told")).to_have_text(numbers)
     page.get_by_role("button", name="Bias x").click()
     expect(charts.nth(0)).to_contain_text("Bias x, mg: Individuals")
     row = page.locator("tr", has=page.get_by_role("button", name="Error in the check poses"))

@@ -9,12 +9,15 @@ const content = document.getElementById("content");
 fillFilter(document.getElementById("filter"));
 
 function summary(q) {
-  const shares = (interval) => (interval ? word("quality.interval", { low: percent(interval[0]), high: percent(interval[1]) }) : "");
+  const shares = (share, n, interval) => (!interval ? "" : [
+    word("quality.of", { passed: Math.round(share * n), n }),
+    word("quality.interval", { low: percent(interval[0]), high: percent(interval[1]) }),
+  ].join("; "));
   const rows = [
     ["quality.units", q.units.toLocaleString(), ""],
     ["quality.attempts", q.attempts.toLocaleString(), ""],
-    ["quality.first_pass", percent(q.first_pass_yield), shares(q.first_pass_yield_interval)],
-    ["quality.yield", percent(q.yield), shares(q.yield_interval)],
+    ["quality.first_pass", percent(q.first_pass_yield), shares(q.first_pass_yield, q.first_pass_units, q.first_pass_yield_interval)],
+    ["quality.yield", percent(q.yield), shares(q.yield, q.yield_units, q.yield_interval)],
   ];
   return element("dl", { class: "figures" }, rows.map(([key, value, more]) =>
     element("div", {}, element("dt", {}, word(key)), element("dd", {}, value, more ? element("small", {}, more) : null))));
@@ -93,6 +96,7 @@ function charts(c, { name, unit: given, points, centre, low, high, mr_mean, mr_h
     value: scaled(value), mark, href: `/runs/${encodeURIComponent(point.run)}`,
     label: [point.serial, timeOf(point.time), amount(name, given, value, 5)].filter(Boolean).join(", "),
   });
+  const told = (value) => amount(name, given, value, 4);
   const limited = points.some((point) => point.limit !== null);
   const ruled = ({ outside }) => (outside === "limits" ? "outside" : outside);
   return [
@@ -106,6 +110,9 @@ function charts(c, { name, unit: given, points, centre, low, high, mr_mean, mr_h
     fitted(title("quality.moving_range"), (at) => controlChart({
       ...at, lines: lines({ centre: [mr_mean], control: [mr_high] }), height: 180,
       points: points.map((point) => marked(point, point.moving_range, point.moving_range_outside ? "outside" : null)),
+    })),
+    element("p", { class: "control-told" }, word("quality.control_told", {
+      mean: told(centre), low: told(low), high: told(high), mr_mean: told(mr_mean), mr_high: told(mr_high),
     })),
     element("p", { class: "muted" }, [word("quality.chart_note"), limited ? word("quality.chart_note_limit") : ""].join(" ").trim()),
   ];
