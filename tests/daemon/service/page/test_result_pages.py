@@ -91,6 +91,7 @@ def test_a_run_shows_figures_documents_trace_and_events(
         {**head, "seq": 5, "event": "ended", "outcome": {"verdict": "fail"}},
     ])  # fmt: skip
     page = opened(f"/runs/{run}")
+    expect(page.locator(".facts div", has_text="Terms of the calibration").locator("dd")).to_have_text("linear")
     expect(page.locator(".banner .word")).to_have_text("FAIL")
     expect(page.get_by_role("heading", name=f"Run of {RETESTED}")).to_be_visible()
     expect(page.locator("tr", has_text="Error in the check poses")).to_contain_text("▲ 63 µg")

@@ -35,6 +35,7 @@ function facts(run) {
     ["run.settles", run.settles ? runLink(run.settles, word("run.settles_link")) : null],
     ["run.device_state", wordOr(`device.${run.device_state}`, run.device_state)],
     ["card.poses", run.poses],
+    ["run.terms", run.terms?.length ? run.terms.join(", ").replaceAll("_", " ") : null],
   ].filter(([, value]) => value !== null && value !== undefined);
   return panel(word("run.facts"), element("dl", { class: "facts" },
     rows.map(([key, value]) => element("div", {}, element("dt", {}, word(key)), element("dd", {}, value)))));
