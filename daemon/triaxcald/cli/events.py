@@ -34,6 +34,8 @@ class EventLines(Events):
 
     def __init__(self, write: Callable[[bytes], object], tray: str, runs: Mapping[str, str]) -> None:
         self._write, self._seq = write, 0
+        self.trouble: OSError | None = None
+        """Why later events were not written."""
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="events", daemon=True)
         super().__init__(self._put, tray, runs, number=self._following)
@@ -62,7 +64,8 @@ class EventLines(Events):
         while (line := self._lines.get()) is not None:
             try:
                 self._write(f"{line}\n".encode())
-            except (OSError, ValueError):  # nobody reads any more; the work goes on
+            except (OSError, ValueError) as e:  # nobody reads any more; the work goes on
+                self.trouble = e if isinstance(e, OSError) else None
                 with suppress(OSError):
                     self._drop()
                 return

@@ -60,6 +60,7 @@ def run_command(a: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bars = stack.enter_context(Bars(place.unit.name for place in station.places))
         receivers: list[Any] = [bars]
+        lines: EventLines | None = None
 
         def ended(outcome: Outcome) -> None:
             say_data_quality(outcome)
@@ -77,9 +78,12 @@ def run_command(a: argparse.Namespace) -> int:
         if a.events:
             runs = {slot: unit.run for slot, unit in tray.units.items()}
             write = stack.enter_context(writes_to(sys.stdout))
-            receivers.append(stack.enter_context(EventLines(write, tray.id, runs)))
+            lines = stack.enter_context(EventLines(write, tray.id, runs))
+            receivers.append(lines)
         outcomes = run_interruptible(tray)
     with showing(worst(outcomes), _told(outcomes)):
+        if lines is not None and lines.trouble is not None:
+            raise lines.trouble
         if a.json:
             emit(Run(format="triaxcal.run/1", units=[_unit(o) for o in outcomes]).document())
         elif not a.events:

@@ -110,3 +110,22 @@ def test_a_device_that_fails_is_said_whatever_becomes_of_standard_output(
     os.close(writing)
     assert done.returncode == 4
     assert done.stderr.startswith("triaxcal: provisioning failed at identity after the reset: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("reader", "words"), [("full", "standard output: No space left on device"), ("gone", "")])
+def test_events_that_nobody_takes_are_an_error_unless_the_reader_has_gone(
+    workshop: Any, reader: str, words: str
+) -> None:
+    if reader == "full":
+        writing = os.open("/dev/full", os.O_WRONLY)
+    else:
+        reading, writing = os.pipe()
+        os.close(reading)
+    station = workshop.station({"bus": {"host": "127.0.0.1", "port": 1}}, plan={"comes_back_s": 0.0})
+    done = _run(PROGRAM, "run", station, "--events", stdout=writing)
+    os.close(writing)
+    assert done.returncode == 4
+    lines = [line for line in done.stderr.splitlines() if "standard output" in line]
+    assert len(lines) == bool(words)
+    assert words in done.stderr
