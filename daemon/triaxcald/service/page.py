@@ -23,6 +23,7 @@ from triaxcald.inputs import measure
 from triaxcald.schema.codes import Code, Stage, Verdict
 from triaxcald.service.api import Access
 from triaxcald.service.errors import ApiError, Problem
+from triaxcald.service.people import Role
 from triaxcald.station.config import Station
 
 FOLDER: Final = Path(__file__).with_name("page")
@@ -153,7 +154,7 @@ def _rendered(
         "faces": file.fixture.names,
         "together": file.fixture.together,
         "operator": file.rules.operator,
-        "person": who.name if who is not None and who.by == "cookie" else None,
+        "person": who.name if who is not None and who.by == "cookie" and who.role is not Role.READER else None,
         "golden": None if file.rules.golden is None else file.rules.golden.serial,
         **given,
     }

@@ -310,7 +310,8 @@ def test_nothing_is_wider_than_the_page(stage: Stage, opened: Opened, size: tupl
     ended(stage)
     page = opened(f"/?lang={language}", viewport={"width": size[0], "height": size[1]})
     expect(page.locator(".card .big")).to_have_count(4)
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    # The verdicts get their size once the cards have theirs.
+    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=size[0], timeout=5000)
     boxes = page.eval_on_selector_all(
         ".card, .card .big b, .task h2, .command button, .command input",
         "all => all.map(e => [e.outerHTML, e.getBoundingClientRect().right])",

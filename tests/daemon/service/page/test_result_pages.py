@@ -259,6 +259,7 @@ def test_an_operator_signs_in_works_and_signs_out(guarded: Stage, browser: Brows
     for pin in ("1234", PIN):
         page.get_by_label("Name").fill("OP:olena")  # as a badge is scanned
         page.get_by_label("PIN").fill(pin)
+        expect(page.get_by_role("button", name="Sign in")).to_be_enabled()
         page.keyboard.press("Enter")
         if pin != PIN:
             expect(page.get_by_role("alert")).to_contain_text("wrong")
@@ -280,6 +281,7 @@ def test_a_reader_is_told_what_the_role_lacks(guarded: Stage, browser: Browser) 
     page.goto(guarded.url + "/sign-in")
     page.locator("#name").fill("petro")
     page.locator("#pin").fill(PIN)
+    expect(page.locator("#sign-in button")).to_be_enabled()
     page.keyboard.press("Enter")
     expect(page.locator("#task-title")).to_have_text("Відскануйте перепустку")
     page.keyboard.type("SN-1")

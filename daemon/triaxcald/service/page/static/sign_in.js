@@ -26,3 +26,6 @@ form.addEventListener("submit", async (e) => {
     button.disabled = false;
   }
 });
+
+// Before this script is here, the form would go nowhere.
+form.querySelector("button").disabled = false;
