@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Mapping
-from contextlib import ExitStack, asynccontextmanager, suppress
+from collections.abc import Awaitable, Callable, Generator, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -637,7 +637,7 @@ class UnitRun(UnitSession):
         return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
 
 
-async def _at_the_disk(work: Callable[[], object]) -> None:
+async def _at_the_disk(work: Callable[[], None]) -> None:
     """Do ``work`` on a thread, to its end: a slow disk holds up no other unit, and
     nothing leaves half of a document."""
     await to_its_end(whole_on_a_thread(work))
@@ -748,13 +748,12 @@ class TrayRun:
 
     async def _all(self) -> list[Outcome]:
         """Raises InputError if the folder cannot be used."""
-        async with _under_way(self._attempts):
-            with ExitStack() as stack:
-                for run in self._runs:
-                    stack.enter_context(at_abort(run.abort_notice))
-                for run in self._runs:
-                    self.units[run.name]._task = asyncio.ensure_future(self._one(run))
-                return await side_by_side(h._task for h in self.units.values() if h._task is not None)
+        with self._attempts.under_way(), ExitStack() as stack:
+            for run in self._runs:
+                stack.enter_context(at_abort(run.abort_notice))
+            for run in self._runs:
+                self.units[run.name]._task = asyncio.ensure_future(self._one(run))
+            return await side_by_side(handle._task for handle in self.units.values() if handle._task is not None)
 
     async def _one(self, run: UnitRun) -> Outcome:
         try:
@@ -767,18 +766,6 @@ class TrayRun:
         self._begin()
         self._ended(outcome)
         return outcome
-
-
-@asynccontextmanager
-async def _under_way(attempts: Attempts) -> AsyncIterator[None]:
-    """Hold the tray's lock, which a slow disk takes long to give. Raises InputError,
-    DiskError."""
-    held = ExitStack()
-    try:
-        await _at_the_disk(partial(held.enter_context, attempts.under_way()))
-        yield
-    finally:
-        await _at_the_disk(held.close)
 
 
 def _attempts_at(station: Station, tray: str) -> Attempts:
