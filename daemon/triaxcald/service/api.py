@@ -21,6 +21,7 @@ from triaxcald.schema.station_state import StationState
 from triaxcald.service.desk import WORK
 from triaxcald.service.errors import ApiError, Problem
 from triaxcald.service.floor import Floor
+from triaxcald.service.people import Role
 from triaxcald.service.stream import Message, TooSlow
 
 ALIVE_S: Final = 2.0
@@ -146,7 +147,7 @@ def station_router(service: Service) -> APIRouter:
     @router.post("/scan")
     async def scan(request: Request, body: ScanBody) -> JSONResponse:
         return await done(
-            request, "operator", "scan", {"text": body.text}, lambda who: floor.scan(body.text, _person(who))
+            request, "operator", "scan", {"text": body.text}, lambda who: floor.scan(body.text, person_of(who))
         )
 
     @router.put("/tray", response_model=StationState)
@@ -159,7 +160,7 @@ def station_router(service: Service) -> APIRouter:
     async def start(request: Request, body: StartBody) -> JSONResponse:
         wanted = None if body.request is None else str(body.request)
         return await done(
-            request, "operator", "start", {"request": wanted}, lambda who: floor.start(wanted, _person(who))
+            request, "operator", "start", {"request": wanted}, lambda who: floor.start(wanted, person_of(who))
         )
 
     @router.post("/tray/stop")
@@ -178,9 +179,9 @@ def station_router(service: Service) -> APIRouter:
     return router
 
 
-def _person(who: Who) -> str | None:
-    """The name of one who has signed in, and not of a program."""
-    return who.name if who.by == "cookie" else None
+def person_of(who: Who) -> str | None:
+    """The name of one who has signed in and may operate; None of programs, readers."""
+    return who.name if who.by == "cookie" and who.role != Role.READER else None
 
 
 async def sent(

@@ -21,9 +21,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from triaxcald.errors import DaemonError
 from triaxcald.inputs import measure
 from triaxcald.schema.codes import Code, Stage, Verdict
-from triaxcald.service.api import Access
+from triaxcald.service.api import Access, person_of
 from triaxcald.service.errors import ApiError, Problem
-from triaxcald.service.people import Role
 from triaxcald.station.config import Station
 
 FOLDER: Final = Path(__file__).with_name("page")
@@ -154,7 +153,7 @@ def _rendered(
         "faces": file.fixture.names,
         "together": file.fixture.together,
         "operator": file.rules.operator,
-        "person": who.name if who is not None and who.by == "cookie" and who.role is not Role.READER else None,
+        "person": None if who is None else person_of(who),
         "golden": None if file.rules.golden is None else file.rules.golden.serial,
         **given,
     }
