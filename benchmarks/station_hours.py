@@ -43,6 +43,7 @@ import numpy as np
 
 from benchmarks.loop_lateness import MOST_S, free_ports
 from benchmarks.table import Table
+from tests.simulated_tray import DEVICE, UNIT
 
 GROWTH_MOST = 5.0
 """MiB of the service's memory per 100 runs, once it is warm."""
@@ -73,26 +74,6 @@ together = true
 [[deliver]]
 name = "mes"
 url = "http://127.0.0.1:{receiver}/results"
-"""
-UNIT = """
-[[units]]
-name = "{slot}"
-profile = "triax-ref-modbus"
-bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
-"""
-DEVICE = """\
-format = "triaxcal.device/1"
-profile = "triax-ref-modbus"
-serial = {serial}
-seed = {serial}
-slot = "{slot}"
-speed = {speed}
-bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
-[sensor]
-noise_g = {noise_g}
-[fixture]
-reaction_s = 0.5
-move_s = 0.6
 """
 WRONG, EMPTY, STOPPED, NOISY = "wrong unit", "empty slot", "stopped", "noisy"
 KINDS = ("", WRONG, "", EMPTY, "", STOPPED, "", NOISY)

@@ -22,6 +22,7 @@ import pytest
 
 from tests.daemon.service.conftest import postgresql as postgresql
 from tests.end_to_end.conftest import Process, until
+from tests.simulated_tray import DEVICE, UNIT
 from triaxcald.schema.result import Result
 from triaxcald.schema.station_state import StationState
 
@@ -52,26 +53,6 @@ together = true
 name = "mes"
 url = "http://127.0.0.1:{receiver}/results"
 token_file = "token"
-"""
-UNIT = """
-[[units]]
-name = "{slot}"
-profile = "triax-ref-modbus"
-bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
-"""
-DEVICE = """\
-format = "triaxcal.device/1"
-profile = "triax-ref-modbus"
-serial = {serial}
-seed = {serial}
-slot = "{slot}"
-speed = {speed}
-bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
-[sensor]
-noise_g = {noise_g}
-[fixture]
-reaction_s = 0.5
-move_s = 0.6
 """
 
 
