@@ -533,16 +533,17 @@ class Ledger:
         with self.reading() as db:
             return [dict(zip(names, row, strict=True)) for row in db.execute(query)]
 
-    def first_judged(self) -> dict[str, int]:
+    def first_judged(self) -> dict[tuple[str, str | None], int]:
         """Time of the first attempt at each unit that passed or failed [µs since 1970],
-        by plain serial number."""
-        filed = tables.filed
-        query = select(filed.c.plain_serial, func.min(filed.c.at_us)).where(
-            filed.c.home == self.home, filed.c.plain_serial.is_not(None), filed.c.tried,
-            filed.c.verdict.in_((Verdict.PASS.value, Verdict.FAIL.value)),
+        by plain serial number and part number."""
+        run, filed = self.run, tables.filed
+        unit = (filed.c.plain_serial, run.c.part_number)
+        query = self._here(select(*unit, func.min(filed.c.at_us))).where(
+            filed.c.home == self.home, filed.c.outcome == run.c.outcome, filed.c.plain_serial.is_not(None),
+            filed.c.tried, filed.c.verdict.in_((Verdict.PASS.value, Verdict.FAIL.value)),
         )  # fmt: skip
         with self.reading() as db:
-            return {str(serial): int(at_us) for serial, at_us in db.execute(query.group_by(filed.c.plain_serial))}
+            return {(serial, part): int(at_us) for serial, part, at_us in db.execute(query.group_by(*unit))}
 
     # Events.
 

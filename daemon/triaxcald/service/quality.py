@@ -38,7 +38,7 @@ COEFFICIENTS: Final = {
 UNITS: Final = {**dict.fromkeys(FIGURES, "g"), **COEFFICIENTS}
 """Unit of each characteristic."""
 COLUMNS: Final = (
-    "run", "serial", "work_serial", "ended", "verdict", "code",
+    "run", "serial", "work_serial", "part_number", "ended", "verdict", "code",
     *FIGURES, *FIGURES.values(), *COEFFICIENTS,
 )  # fmt: skip
 
@@ -54,6 +54,8 @@ RUN_OF: Final = 8
 JUDGED: Final = (Verdict.PASS, Verdict.FAIL)
 
 Row = Mapping[str, Any]
+Unit = tuple[str, str | None]
+"""Plain serial number, and part number: products may be numbered each for itself."""
 Floats = NDArray[np.float64]
 
 
@@ -62,11 +64,11 @@ class _Attempts:
 
     def __init__(self, rows: Iterable[Row]) -> None:
         self.rows: list[Row] = []
-        self.by_unit: dict[str, list[Row]] = {}
-        """By plain serial number: that of the work, else the one that the unit
-        reported. Without either, nobody knows the unit."""
+        self.by_unit: dict[Unit, list[Row]] = {}
+        """By the serial number of the work, else the one that the unit reported.
+        Without either, nobody knows the unit."""
         seen: set[str] = set()
-        number: dict[str, int] = {}
+        number: dict[Unit, int] = {}
         units = []
         for row in rows:
             # The folder may hold copies of outcomes; a golden unit checks the station.
@@ -79,9 +81,9 @@ class _Attempts:
             if serial is None:
                 units.append(-1)
                 continue
-            plain = plain_serial(serial)
-            self.by_unit.setdefault(plain, []).append(row)
-            units.append(number.setdefault(plain, len(number)))
+            unit = plain_serial(serial), row["part_number"]
+            self.by_unit.setdefault(unit, []).append(row)
+            units.append(number.setdefault(unit, len(number)))
         self._units = np.array(units, dtype=np.intp)
         order = sorted(range(len(units)), key=lambda i: (self.rows[i]["ended"], self.rows[i]["run"] or ""))
         self._rank = np.empty(len(units), dtype=np.intp)
@@ -99,19 +101,18 @@ class _Attempts:
         return [self.rows[i] for i in chosen.tolist()], values[chosen]
 
 
-def quality_of(rows: Iterable[Row], first_judged_us: Mapping[str, int] | None = None) -> dict[str, Any]:
+def quality_of(rows: Iterable[Row], first_judged_us: Mapping[Unit, int] | None = None) -> dict[str, Any]:
     """`triaxcal.quality/1` of these rows. ``first_judged_us`` has the time of the first
-    judged attempt at a unit, by plain serial number, also where that is not among the
-    rows."""
+    judged attempt at a unit, also where that is not among the rows."""
     attempts, before = _Attempts(rows), first_judged_us or {}
     passed, passed_first = [], []
-    for serial, of_unit in attempts.by_unit.items():
+    for unit, of_unit in attempts.by_unit.items():
         if (last := _last(of_unit)) is None:
             continue
         passed.append(last["verdict"] == Verdict.PASS)
         first = next((row for row in of_unit if row["verdict"] in JUDGED), None)
         at_us = (first or of_unit[0])["at_us"]
-        if before.get(serial, at_us) >= at_us:
+        if before.get(unit, at_us) >= at_us:
             passed_first.append(first is not None and first["verdict"] == Verdict.PASS)
     codes = Counter(row["code"] for row in attempts.rows if row["code"] is not None)
     return {

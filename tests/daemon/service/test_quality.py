@@ -43,7 +43,7 @@ def verdicts(**by_serial: str) -> list[dict[str, Any]]:
     return [row(at, serial, word) for at, (serial, word) in enumerate(told)]
 
 
-def counts(rows: Iterable[dict[str, Any]], before: dict[str, int] | None = None) -> list[Any]:
+def counts(rows: Iterable[dict[str, Any]], before: dict[tuple[str, str | None], int] | None = None) -> list[Any]:
     document = Quality.model_validate(quality_of(rows, before)).document()
     return [
         document[key] for key in ("units", "first_pass_units", "first_pass_yield", "yield_units", "yield", "attempts")
@@ -113,8 +113,15 @@ def test_a_provisioning_and_a_copy_of_an_outcome_are_no_attempts() -> None:
 
 def test_a_retest_is_no_first_pass_although_the_first_attempt_was_not_asked_for() -> None:
     rows = [row(10, "01"), row(11, "2"), row(12, "3", "aborted"), row(13, "4", "aborted")]
-    first_judged_us = {"1": 5 * 60_000_000, "2": 11 * 60_000_000, "3": 5 * 60_000_000}
+    first_judged_us = {(serial, None): at * 60_000_000 for serial, at in (("1", 5), ("2", 11), ("3", 5))}
     assert counts(rows, first_judged_us) == [4, 2, 0.5, 4, 0.5, 4]
+
+
+def test_products_that_are_numbered_each_for_itself_are_other_units() -> None:
+    rows = [row(10, "7", "fail", part_number="A"), row(11, "7", part_number="B"), row(12, "07", part_number="B")]
+    before = {("7", "A"): 10 * 60_000_000, ("7", "B"): 11 * 60_000_000}
+    assert counts(rows, before) == [2, 2, 0.5, 2, 0.5, 3]
+    assert counts(rows[1:], before) == [1, 1, 1.0, 1, 1.0, 2]
 
 
 @pytest.mark.parametrize(("count", "of"), [(0, 10), (1, 10), (10, 10), (43, 50), (19990, 20000)])
