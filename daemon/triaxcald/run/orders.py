@@ -14,11 +14,13 @@ from triaxcald.work import Work
 
 
 class RuleBroken(InputError):
-    """A rule of the station forbids to begin; ``rule`` is its key."""
+    """A rule of the station forbids to begin; ``rule`` is its key, ``work`` that of
+    the unit that it forbids."""
 
-    def __init__(self, rule: str, message: str) -> None:
+    def __init__(self, rule: str, message: str, work: Work | None = None) -> None:
         super().__init__(message)
         self.rule = rule
+        self.work = work
 
 
 def with_serials(station: Station, serials: Sequence[tuple[str, str]]) -> Station:
@@ -85,4 +87,5 @@ def require_allowed(rules: Rules, work: Work, serial: str, history: History) -> 
             "retest_reason",
             f"unit {work.slot}: serial number {serial} has passed before, and rules.retest_reason asks for a reason; "
             "give --reason TEXT",
+            work,
         )

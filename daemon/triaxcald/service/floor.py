@@ -295,7 +295,7 @@ class Floor:
             check_lines(station.places, where=str(station.path))
         except RuleBroken as e:
             problem = _OF_RULE.get(e.rule, Problem.INVALID)
-            raise ApiError(problem, _TOLD.get(e.rule, str(e))) from e
+            raise ApiError(problem, _told(e)) from e
         except InputError as e:
             raise ApiError(Problem.INVALID, str(e)) from e
         receiver = _Receiver(self._took, self.stream)
@@ -451,16 +451,22 @@ class Floor:
             raise InputError(f"{station.path}: name changes with a restart of the service")
 
 
+def _told(broken: RuleBroken) -> str:
+    """What to do at a page instead of a command line."""
+    if broken.rule == "operator":
+        return "no operator; scan the badge"
+    if broken.rule == "retest_reason" and broken.work is not None:
+        unit = f"unit {broken.work.serial} in slot {broken.work.slot}"
+        return f"{unit} has passed before; give the reason of the re-test"
+    return str(broken)
+
+
 def _desk_of(station: Station) -> Desk:
     slots = [(place.unit.name, place.unit.serial) for place in station.places]
     return Desk(station.file.name, slots, station.file.work.model_dump(), station.file.fixture.names, now())
 
 
 _OF_RULE: Final = {"attempts": Problem.ATTEMPTS_USED, "retest_reason": Problem.REASON_MISSING}
-_TOLD: Final = {
-    "operator": "no operator; scan the badge",
-    "retest_reason": "a unit of this tray has passed before; give the reason of the re-test",
-}
 _BLOCKED: Final = {
     Problem.DISK: "the disk is full; free some space in the station's folder",
     Problem.DATABASE: "the database takes nothing; see the log of the service",

@@ -320,7 +320,7 @@ function inTurn(work) {
     } catch (e) {
       tell(at("taken"), "");
       if (!(e instanceof Refused)) throw e;
-      if (e.code === "reason_missing") askForReason();
+      if (e.code === "reason_missing") askForReason(e);
       else showError(e);
     }
   });
@@ -372,8 +372,9 @@ function start() {
   });
 }
 
-function askForReason() {
+function askForReason({ message }) {
   const dialog = at("retest-dialog");
+  at("retest-unit").textContent = message;
   const field = at("retest-reason");
   field.value = "";
   dialog.returnValue = "";
