@@ -72,6 +72,23 @@ def test_a_filter_goes_into_the_address_and_to_the_interface(runs: list[dict[str
     expect(page.locator("tbody tr")).to_have_count(50)
 
 
+def test_a_filter_is_on_paper_and_goes_on_to_the_runs_of_a_reason(runs: list[dict[str, Any]], opened: Opened) -> None:
+    page = opened("/quality?slot=a&since=2030-01-01T00:10:00.000Z", timezone_id="Europe/Kyiv")
+    expect(page.get_by_label("From")).to_have_value("2030-01-01T02:10")
+    filtered = page.locator("#filtered")
+    expect(filtered).to_be_hidden()
+    page.emulate_media(media="print")
+    expect(filtered).to_have_text("Slot: a; From: 2030-01-01 02:10")
+    expect(filtered).to_be_visible()
+    page.emulate_media(media="screen")
+    with page.expect_request("**/api/1/runs?*") as asked:
+        page.locator(".pareto tbody tr").first.get_by_role("link").click()
+    query = parse_qs(urlsplit(asked.value.url).query)
+    assert (query["slot"], query["since"]) == (["a"], ["2030-01-01T00:10:00.000Z"])
+    chosen = page.get_by_label("Code").locator("option:checked")
+    expect(chosen).to_have_text(re.compile(r"\w+ .*\."))
+
+
 def test_a_filter_that_no_run_fits_says_so(runs: list[dict[str, Any]], opened: Opened) -> None:
     page = opened("/runs?order=none")
     expect(page.get_by_text("No run fits this filter.")).to_be_visible()

@@ -26,7 +26,7 @@ function summary(q) {
 function reasons(q) {
   const bars = Object.entries(q.codes).filter(([code, count]) => count && code !== "within_limits")
     .map(([name, count]) => ({ name, count, title: meaning(name) }));
-  const filter = asked();
+  const filter = new URLSearchParams(location.search);
   const href = (code) => {
     filter.set("code", code);
     return `/runs?${filter}`;
@@ -143,7 +143,7 @@ try {
     };
     choice.addEventListener("change", show);
     content.replaceChildren(...[
-      summary(q), reasons(q),
+      summary(q), element("p", { class: "muted" }, word("quality.one_value")), reasons(q),
       list.length ? element("section", { class: "panel" },
         element("div", { class: "pick" }, element("label", { for: "characteristic" }, word("quality.chart")), choice), place) : null,
       list.length ? characteristics(list, pick) : null,

@@ -4,12 +4,18 @@ import { characteristicName, element, meaning, microG, runLink, timeOf, unitLink
 
 const TIMES = ["since", "until"];
 
-/** Fills the form from the address. */
+/** Fills the form from the address, and says what it asks for: on paper the form is not
+ * shown. */
 export function fillFilter(form) {
+  const told = [];
   for (const [key, value] of new URLSearchParams(location.search)) {
     const field = form.elements.namedItem(key);
-    if (field) field.value = value;
+    if (!field || !value) continue;
+    field.value = TIMES.includes(key) ? localTime(value) : value;
+    const shown = field.selectedOptions?.[0]?.textContent ?? field.value.replace("T", " ");
+    if (shown) told.push(`${field.labels[0].firstChild.textContent}: ${shown}`);
   }
+  document.getElementById("filtered").textContent = told.join("; ");
   if (matchMedia("(max-width: 36rem)").matches) form.closest("details").open = false;
   // What is empty asks for nothing: it stays out of the address.
   form.addEventListener("submit", (e) => {
@@ -17,6 +23,13 @@ export function fillFilter(form) {
     const given = [...new FormData(form)].map(([key, value]) => [key, String(value).trim()]).filter(([, value]) => value);
     location.search = new URLSearchParams(given).toString();
   });
+}
+
+/** A time of the address as a field for local times takes it. */
+function localTime(text) {
+  const time = new Date(text);
+  if (!/Z|[+-]\d\d:?\d\d$/.test(text) || Number.isNaN(time.getTime())) return text;
+  return new Date(time.getTime() - 60000 * time.getTimezoneOffset()).toISOString().slice(0, 16);
 }
 
 /** What the address asks for, as the interface takes it: times in UTC. */
