@@ -3,6 +3,7 @@ cross-validation."""
 
 from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult, Reduced, Residual, reduced
 from triaxcal.estimate.creep import with_unexplained_creep
+from triaxcal.estimate.device_correction import DeviceCorrection, device_correction, uncorrected
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.pose_fit import fit, poses_of_means
 from triaxcal.estimate.recordings import (
@@ -13,14 +14,18 @@ from triaxcal.estimate.recordings import (
     shape_of,
     shape_without_effects,
 )
+from triaxcal.model.correction import LinearCorrection
 
 __all__ = [
     "Calibration",
+    "DeviceCorrection",
     "Exclusion",
     "HoldOut",
+    "LinearCorrection",
     "PoseResult",
     "Reduced",
     "Residual",
+    "device_correction",
     "fit",
     "gather",
     "magnitude_errors",
@@ -31,5 +36,6 @@ __all__ = [
     "shape_in",
     "shape_of",
     "shape_without_effects",
+    "uncorrected",
     "with_unexplained_creep",
 ]

@@ -507,7 +507,7 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
     if len(kept) == len(c.sensor.effects):
         return Reduced(c, 0.0)
     # Outputs of the whole sensor all over the sphere, under the covariates of use.
-    up, covariates = _readings(c, logged or {})
+    up, covariates = readings_in_use(c, logged or {})
     u = c.sensor.output(up, covariates)
     sensor = Sensor(c.sensor.scale_factor, c.sensor.misalignment, c.sensor.bias, tuple(kept))
     # Gauss–Newton: fit the kept terms to |a(u)| = reference on these outputs.
@@ -518,22 +518,34 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
     # What an error of the whole calibration becomes: the kept parameters follow
     # |a| as nearly as they can.
     through = _gain(sensor.radius_by_parameters(u, covariates)) @ c.sensor.radius_by_parameters(u, covariates)
-    # Mask of the parameters that stay: the nine, and those of the kept effects.
-    own = np.concatenate([np.ones(9, bool), *(np.full(len(q), keep(e)) for e, q in c.sensor.effects)])
-    names = {effect.name for effect, _ in kept}
-    needed = {name for effect, _ in kept for name in effect.needs}
+    return Reduced(projected(c, sensor, through, u, covariates), rms(off))
+
+
+def projected(
+    c: Calibration, sensor: Sensor, through: Floats, u: Floats, covariates: Mapping[str, Floats]
+) -> Calibration:
+    """The calibration ``c`` with another ``sensor``, whose parameters have the errors
+    ``through`` (9+q,9+p) times those of ``c``. ``u`` (n,3) are readings all over the
+    sphere, under the ``covariates``."""
+    kept = [effect for effect, _ in sensor.effects]
+    names = {effect.name for effect in kept}
+    needed = {name for effect in kept for name in effect.needs}
+    # Prior standard deviations of the coefficients that both have.
+    prior_sd = {} if c.prior_sd is None else dict(zip(c.parameters[9:], c.prior_sd, strict=True))
+    coefficients = [f"{effect.name}.{q.name}" for effect in kept for q in effect.coefficients]
+    known = c.prior_sd is not None and {*coefficients} <= {*prior_sd}
     calibration = replace(
         c,
         sensor=sensor,
         covariance=through @ c.covariance @ through.T,
         thermal=None if c.thermal is None else through @ c.thermal @ through.T,
-        prior_sd=None if c.prior_sd is None else c.prior_sd[own[9:]],
+        prior_sd=np.array([prior_sd[n] for n in coefficients]) if known else None,
         weights={name: p for name, p in c.weights.items() if name in names},
         unmodelled=_unmodelled(c, sensor, through, u, covariates),
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
         update=None if c.update is None else _update(c.update, through),
     )
-    return Reduced(_with_residual(calibration) if c.poses else calibration, rms(off))
+    return _with_residual(calibration) if c.poses else calibration
 
 
 def _update(update: BiasUpdate, through: Floats) -> BiasUpdate:
@@ -569,7 +581,7 @@ def _with_residual(c: Calibration) -> Calibration:
     return replace(c, residual=Residual(rms(off), largest, None, floor, None))
 
 
-def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:
+def readings_in_use(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:
     """(m,3) specific forces over the sphere and the covariates of a unit in use:
     logged channels as in some of the poses, clocks at the moment of the
     calibration, other covariates at their reference."""
