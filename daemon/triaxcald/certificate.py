@@ -21,6 +21,14 @@ import triaxcal_drivers as td
 from triaxcald.caveats import is_passing
 from triaxcald.computer import compute_with_one_thread
 from triaxcald.documents import loop_document, rezero_document
+from triaxcald.provision.correction import (
+    free_coefficients,
+    has_form,
+    register_values,
+    removed_from,
+    start_of_fit,
+    with_values,
+)
 from triaxcald.provision.registers import RegisterImage, build_image
 from triaxcald.raw_to_poses import Pipeline, of_poses
 from triaxcald.recording.schema import RawDigest
@@ -46,6 +54,10 @@ class Certified:
     image: RegisterImage | None
     within_limits: bool
     updated: tc.estimate.Calibration | None = None
+    better: bool = True
+    """Whether the registers beat what the device holds, by more than that prediction
+    can be wrong."""
+    at_start: Mapping[str, bytes] | None = None
 
     @property
     def calibration(self) -> tc.estimate.Calibration:
@@ -75,10 +87,13 @@ def certify(
     signs: tuple[int, int, int],
     computed_with: Mapping[str, str],
     earlier: tc.inputs.Earlier | None = None,
+    at_start: Mapping[str, bytes] | None = None,
 ) -> Certified:
     """``computed_with``: `software` of the station, so that an audit years
     later can get the same bytes. ``earlier``: the calibration of which the
-    poses renew the biases alone.
+    poses renew the biases alone. ``at_start``: the registers by which the device
+    corrected while the poses were taken, where its profile has a form of
+    correction.
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
@@ -92,17 +107,18 @@ def certify(
     )
 
     compute_with_one_thread()
+    profile = bundle.profile
+    poses = removed_from(profile, poses, at_start)
     loop = updated = None
     if earlier is None:
         loop = tc.diagnosis.diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
         after = loop.after
     else:
         after = updated = tc.inputs.updated_biases(poses, earlier)
-    profile = bundle.profile
     stated = station.stated(profile)
     measured_ns = pipeline.first_host_ns or 0
-    held = held_by_device(profile, after)
-    image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
+    held = held_by_device(profile, after, at_start=at_start)
+    image = image_of(profile, held, measured_ns // (DAY_S * 1_000_000_000)) if held else None
     output_unit = profile.output.unit
     quality = pipeline.data_quality() + of_poses(poses, output_unit)
     if loop is None:
@@ -139,7 +155,7 @@ def certify(
         not_written=why_not_written(profile),
         registers=_registers_part(image, held, after, poses, stated) if image and held else None,
     ).document()
-    return Certified(document, loop, image, not outside, updated)
+    return Certified(document, loop, image, not outside, updated, _is_better(image, held), at_start)
 
 
 def roles(sensor: tc.Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:
@@ -158,7 +174,12 @@ def roles(sensor: tc.Sensor, channel_reference: Mapping[str, float]) -> dict[str
 
 def why_not_written(profile: td.Profile) -> str | None:
     """Why a device cannot take a calibration at all: without one of the nine,
-    the other eight would be wrong."""
+    the other eight would be wrong. One with a correction of another form takes what
+    it can."""
+    if has_form(profile):
+        return (
+            None if free_coefficients(profile) else "the device has no register of its correction that can be written"
+        )
     missing = [role for role in td.roles.LINEAR_ROLES if profile.by_role(role) is None]
     return f"the device has no register for {', '.join(missing)}" if missing else None
 
@@ -168,19 +189,29 @@ class HeldByDevice:
     """What a device can hold of a calibration: ``registers`` are the whole
     correction, as nearly as its registers have it, at the moment for which that
     holds. ``beside_process`` is the same beside what belongs to the recording
-    and not to the unit, in the recording's own poses."""
+    and not to the unit, in the recording's own poses. ``correction`` are the
+    coefficients of a device with a form of correction, of which ``registers`` are the
+    equivalent."""
 
     registers: tc.estimate.Reduced
     beside_process: tc.estimate.Calibration
+    correction: tc.estimate.DeviceCorrection | None = None
 
 
 def held_by_device(
-    profile: td.Profile, full: tc.estimate.Calibration, logged: Mapping[str, tc.Floats] | None = None
+    profile: td.Profile,
+    full: tc.estimate.Calibration,
+    logged: Mapping[str, tc.Floats] | None = None,
+    at_start: Mapping[str, bytes] | None = None,
 ) -> HeldByDevice | None:
     """None where the device cannot take a calibration at all. ``logged`` as
-    `triaxcal.estimate.projected_calibration.reduced` has it."""
+    `triaxcal.estimate.reduced` has it, ``at_start`` as `certify`."""
     if why_not_written(profile):
         return None
+    if has_form(profile):
+        free = free_coefficients(profile)
+        found = tc.estimate.device_correction(full, start_of_fit(profile, at_start), free, logged)
+        return HeldByDevice(found.equivalent, found.equivalent.calibration, found)
 
     def has(effect: tc.effects.Effect) -> bool:
         return all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
@@ -189,11 +220,16 @@ def held_by_device(
     return HeldByDevice(tc.estimate.reduced(full, has, logged), beside)
 
 
-def image_of(profile: td.Profile, registers: tc.estimate.Calibration, date_days: int) -> RegisterImage:
+def image_of(profile: td.Profile, held: HeldByDevice, date_days: int) -> RegisterImage:
     """Of the coefficients as they are printed, so that the words follow from
     the document. Raises RegisterValueError where a value does not go into its
     register."""
-    wanted = {role: tc.rounding.number(v) for role, v in roles(registers.sensor, registers.channel_reference).items()}
+    if held.correction is not None:
+        values = register_values(profile, held.correction.correction)
+    else:
+        registers = held.registers.calibration
+        values = roles(registers.sensor, registers.channel_reference)
+    wanted = {role: tc.rounding.number(v) for role, v in values.items()}
     return build_image(
         profile, {r: v for r, v in wanted.items() if v is not None and profile.by_role(r)}, date_days=date_days
     )
@@ -205,7 +241,7 @@ def with_registers(
     """With the registers for other coefficients, ``wanted`` by role, than were
     computed: those of a stored certificate that says the same."""
     profile, full, image = bundle.profile, certified.calibration, certified.image
-    held = held_by_device(profile, full)
+    held = held_by_device(profile, full, at_start=certified.at_start)
     if image is None or held is None:
         return certified
     days = next((w.value for w in image.words if w.role == td.roles.DATE_ROLE), 0)
@@ -213,7 +249,8 @@ def with_registers(
     image = build_image(profile, coefficients | dict(wanted), date_days=int(days))
     poses = [p.pose for p in full.poses]
     registers = _registers_part(image, held, full, poses, station.stated(profile)).document()
-    return replace(certified, image=image, document={**certified.document, "registers": registers})
+    document = {**certified.document, "registers": registers}
+    return replace(certified, image=image, document=document, better=_is_better(image, held))
 
 
 def _registers_part(
@@ -223,14 +260,23 @@ def _registers_part(
 
     registers = held.registers.calibration
     in_registers = list(registers.terms)
-    budget = tc.uncertainty.budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost))
+    if held.correction is None:
+        rounding_rms = rounding_cost(image, registers, poses)
+        stated = replace(stated, rounding=_steps(image), not_held=held.registers.cost)
+        of_form = {}
+    else:
+        rounding_rms = held.correction.rounding_rms(_rounded(image, held.correction))
+        stated = replace(stated, not_held=float(np.hypot(held.registers.cost, rounding_rms)))
+        of_form = _of_form(image, held.correction)
+    budget = tc.uncertainty.budget(registers, stated)
     return RegistersOfCertificate(
+        **of_form,
         terms=in_registers,
         left_to_host=[name for name in full.terms if name not in in_registers],
         holds=registers_hold(registers, full),
         rms_g=tc.rounding.error(held.beside_process.residual.rms_g),
         cost_rms_g=tc.rounding.error(held.registers.cost),
-        rounding_rms_g=tc.rounding.error(rounding_cost(image, registers, poses)),
+        rounding_rms_g=tc.rounding.error(rounding_rms),
         uncertainty=tc.schema.Uncertainty.model_validate(tc.interchange.budget_document(registers, budget)),
         words=[
             RegisterWord(
@@ -244,6 +290,32 @@ def _registers_part(
             for w in image.words
         ],
     )
+
+
+def _of_form(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> dict[str, Any]:
+    """What a device with a form of correction leaves, and gains."""
+    from triaxcald.schema.certificate import OwnError
+
+    rounded = _rounded(image, found)
+    return {
+        "fixed": [role for role in td.roles.CORRECTION_ROLES[:12] if role not in found.free],
+        "left_rms_g": tc.rounding.error(found.left_rms),
+        "left_largest_g": tc.rounding.error(found.left_largest),
+        "own_rms_g": OwnError(
+            before=tc.rounding.error(found.own_rms), predicted=tc.rounding.error(found.predicted_rms(rounded))
+        ),
+        "better": found.better(rounded),
+    }
+
+
+def _rounded(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> tc.estimate.LinearCorrection:
+    return with_values(found.correction, {word.role: word.held for word in image.words})
+
+
+def _is_better(image: RegisterImage | None, held: HeldByDevice | None) -> bool:
+    if image is None or held is None or held.correction is None:
+        return True
+    return held.correction.better(_rounded(image, held.correction))
 
 
 def registers_hold(registers: tc.estimate.Calibration, full: tc.estimate.Calibration) -> list[str]:

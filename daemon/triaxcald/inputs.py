@@ -17,6 +17,7 @@ from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.documents import TooManyContainers, json_value
 from triaxcald.errors import InputError, RecordingError
+from triaxcald.provision.correction import from_attachments, removed_from
 from triaxcald.provision.identity import same_serial
 from triaxcald.raw_to_poses import Pipeline, of_poses, together
 from triaxcald.recording.bus import require_of_unit
@@ -169,8 +170,12 @@ def _measure_recording(
         too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
     )  # fmt: skip
 
+    at_start = from_attachments(recording.attachments, recording.name)
+
     def parted(turn_s: float | None) -> Measured:
         poses = pipeline.parted(turn_s)
+        if stream == td.READINGS and phase == CALIBRATION:
+            poses = removed_from(bundle.profile, poses, at_start)
         quality = (
             pipeline.data_quality() + lost + ([] if moments is not None else of_poses(poses, pipeline.output_unit))
         )

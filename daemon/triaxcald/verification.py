@@ -122,12 +122,26 @@ def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> tc.Floats:
 
 
 def verified(pipeline: Pipeline, reference: float) -> Verification:
-    """The whole of a corrected stream, with what it is to be blamed for.
+    """The whole of a device's own output, with what it is to be blamed for.
     Finishes the ``pipeline``."""
     compute_with_one_thread()
     poses = pipeline.finish()
     quality = pipeline.data_quality() + of_poses(poses, pipeline.output_unit)
-    return replace(verify(poses, reference), data_quality=tuple(quality))
+    in_g = _per_g(poses, pipeline.bundle.profile.output_per_g)
+    return replace(verify(in_g, reference), data_quality=tuple(quality))
+
+
+def _per_g(poses: list[tc.Pose], output_per_g: float) -> list[tc.Pose]:
+    """Poses of a device's own output in g."""
+    if output_per_g == 1.0:
+        return poses
+    return [
+        replace(
+            p, mean=p.mean / output_per_g, covariance=p.covariance / output_per_g**2,
+            scatter=p.scatter / output_per_g**2, creep=p.creep / output_per_g, slope=p.slope / output_per_g,
+        )
+        for p in poses
+    ]  # fmt: skip
 
 
 def errors_under(poses: Sequence[tc.Pose], model: tc.estimate.Calibration, reference: float) -> Verification:

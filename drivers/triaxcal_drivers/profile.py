@@ -14,12 +14,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.registers import RawType
-from triaxcal_drivers.roles import AXES
+from triaxcal_drivers.roles import (
+    AXES,
+    CORRECTION,
+    CORRECTION_GROUPS,
+    CORRECTION_ROLES,
+    OFFSET_ROLES,
+    OTHER_ROLES,
+    REFERENCE_ROLE,
+)
 
 READINGS, CORRECTED = "readings", "corrected"
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
@@ -95,7 +103,8 @@ class Register(Strict):
 
     Roles: ``scale_factor.x`` [output unit/g], ``misalignment.x`` [rad],
     ``bias.x`` [g], any effect's coefficient (``second_order_nonlinearity.x``,
-    ``temperature_bias.y``…), ``reference_temperature`` [°C],
+    ``temperature_bias.y``…); or ``matrix.xx``, ``offset.x`` … of a `Correction`
+    with a form (``.t1`` per K, ``.t2`` per K²); ``reference_temperature`` [°C],
     ``calibration_date`` (days since 1970-01-01), ``calibration_crc``,
     ``serial_number``, ``write_counter``. The value is ``raw * scale + offset``;
     it is an exact integer where type, scale and offset are integers.
@@ -170,19 +179,43 @@ class Crc(Strict):
 
 
 class Correction(Strict):
-    """How the device corrects its readings by its calibration registers."""
+    """How the device corrects its readings by its calibration registers.
 
-    readings: Annotated[
-        Literal["before"] | None,
-        Field(description='"before": streams.readings are not corrected by the calibration registers'),
+    Without ``form``, u = K (R a + b) with the nine roles of the linear model. With
+    it, u is the reading before the correction and y the one after it; a parameter
+    without a register is fixed, C at its nominal diagonal.
+    """
+
+    form: Annotated[
+        Literal["matrix", "matrix-after"] | None,
+        Field(description='"matrix": y = C (u − o); "matrix-after": y = C u − o, by roles matrix.xx … and offset.x …'),
     ] = None
+    readings: Annotated[
+        Literal["before", "after"] | None,
+        Field(
+            description='"before": streams.readings are not corrected by the calibration registers; '
+            '"after": they are, and there is no other output'
+        ),
+    ] = None
+    output_per_g: Annotated[float, Field(gt=0, description="of y: 9.80665 where y is in m/s²")] = 1.0
 
-    @field_validator("readings", mode="before")
-    @classmethod
-    def _supported(cls, given: object) -> object:
-        if given == "after":
-            raise ValueError('readings after the device\'s correction are not supported yet: expected "before"')
-        return given
+    @model_validator(mode="after")
+    def _of_a_form(self) -> Self:
+        if self.form is None and self.readings == "after":
+            raise ValueError(f"readings after the device's correction need a form: {_FORMS}")
+        if self.form is None and "output_per_g" in self.model_fields_set:
+            raise ValueError(f"output_per_g needs a form: {_FORMS}")
+        return self
+
+
+_FORMS = '"matrix" for y = C (u − o), "matrix-after" for y = C u − o'
+ONE_UNIT = 0.5
+"""Readings whose nominal output per g differs by a smaller share from that of the
+corrected ones are in the same unit: no other unit of acceleration is so near."""
+
+
+def _is_of_form(role: str | None) -> bool:
+    return role is not None and role.partition(".")[0] in CORRECTION
 
 
 class Profile(Strict):
@@ -224,7 +257,94 @@ class Profile(Strict):
         roles = Counter(r.role for r in self.registers.values() if r.role)
         for role in sorted(r for r, count in roles.items() if count > 1):
             raise ValueError(f"registers: role '{role}' is given twice")
+        self._require_sound_correction()
         return self
+
+    def _require_sound_correction(self) -> None:
+        """Raises ValueError where the roles do not go with the form of the
+        correction, or with each other."""
+        of_form = {r.role: name for name, r in self.registers.items() if _is_of_form(r.role)}
+        form = None if self.correction is None else self.correction.form
+        for role, name in of_form.items():
+            if role not in CORRECTION_ROLES:
+                raise ValueError(f"registers.{name}: no role '{role}'{nearest(role, CORRECTION_ROLES)}")
+        if of_form and form is None:
+            role, name = next(iter(of_form.items()))
+            raise ValueError(f"registers.{name}: the role {role} needs [correction] form = {_FORMS}")
+        if form is None:
+            return
+        if not of_form:
+            raise ValueError(f"correction: form needs registers with roles such as {', '.join(OFFSET_ROLES)}")
+        for name, r in self.registers.items():
+            if r.role is not None and r.role not in of_form and r.role not in OTHER_ROLES:
+                other, theirs = next(iter(of_form.items()))
+                raise ValueError(
+                    f"registers.{name}: the role {r.role} does not go with {other} (registers.{theirs}): a device "
+                    f'corrects either by form = "{form}" or by the model of scale factor, misalignment and bias'
+                )
+        for group in CORRECTION_GROUPS:
+            missing = [role for role in group if role not in of_form]
+            if missing and len(missing) < len(group):
+                raise ValueError(
+                    f"registers: roles {', '.join(r for r in group if r in of_form)} without {', '.join(missing)}: "
+                    "expected a register for each axis"
+                )
+        if any(role.endswith((".t1", ".t2")) for role in of_form) and self.by_role(REFERENCE_ROLE) is None:
+            raise ValueError(f"registers: roles with .t1 or .t2 need one with the role {REFERENCE_ROLE}")
+        self._require_sound_outputs()
+
+    def _require_sound_outputs(self) -> None:
+        assert self.correction is not None
+        per_g, nominal = self.correction.output_per_g, self.output.nominal_scale_factor
+        if self.correction.readings == "after":
+            if CORRECTED in self.streams:
+                raise ValueError('correction: with readings = "after" there is no streams.corrected beside them')
+            if nominal is not None and not self._one_unit:
+                raise ValueError(
+                    f"correction: output_per_g = {per_g:g}, and output.nominal_scale_factor says "
+                    f'{", ".join(f"{n:g}" for n in nominal)}: with readings = "after" both are of the same output'
+                )
+        elif nominal is None:
+            raise ValueError("correction: form needs output.nominal_scale_factor")
+
+    @property
+    def _one_unit(self) -> bool:
+        """Whether readings and corrected output are in one unit."""
+        per_g = 1.0 if self.correction is None else self.correction.output_per_g
+        nominal = self.output.nominal_scale_factor
+        return nominal is None or all(abs(abs(n) / per_g - 1) < ONE_UNIT for n in nominal)
+
+    @property
+    def nominal_diagonal(self) -> tuple[float, float, float]:
+        """Of the matrix C of the correction: as in a device that holds no
+        calibration."""
+        nominal = self.output.nominal_scale_factor
+        if self.correction is None or nominal is None or self._one_unit:
+            return (1.0, 1.0, 1.0)
+        x, y, z = (self.correction.output_per_g / n for n in nominal)
+        return (x, y, z)
+
+    @property
+    def own_output(self) -> str | None:
+        """The stream of the device's own corrected output; None without one."""
+        return CORRECTED if CORRECTED in self.streams else READINGS if self.reads_corrected else None
+
+    @property
+    def output_per_g(self) -> float:
+        """Of `own_output`, in its unit."""
+        return 1.0 if self.correction is None else self.correction.output_per_g
+
+    def nominal_of(self, stream: str) -> tuple[float, float, float] | None:
+        """Nominal output per g of a stream; None where nobody knows it."""
+        nominal = self.output.nominal_scale_factor
+        if stream != self.own_output or (self.reads_corrected and nominal is not None):
+            return nominal
+        return (self.output_per_g,) * 3
+
+    @property
+    def reads_corrected(self) -> bool:
+        """Whether `streams.readings` are corrected by the calibration registers."""
+        return self.correction is not None and self.correction.readings == "after"
 
     def files(self) -> tuple[str, ...]:
         """Names of the files this profile refers to (DBC, EDS), relative to it."""

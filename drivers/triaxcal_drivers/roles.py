@@ -18,6 +18,22 @@ LINEAR = (SCALE_FACTOR, MISALIGNMENT, BIAS)
 LINEAR_ROLES = tuple(f"{quantity}.{axis}" for quantity in LINEAR for axis in AXES)
 """A device without one of these nine cannot take a calibration."""
 
+MATRIX, OFFSET = "matrix", "offset"
+CORRECTION = (MATRIX, OFFSET)
+"""The quantities of a correction ``y = C (u − o)`` that a device makes."""
+DIAGONAL_ROLES = tuple(f"{MATRIX}.{axis}{axis}" for axis in AXES)
+UPPER_ROLES = tuple(f"{MATRIX}.{axes}" for axes in ("xy", "xz", "yz"))
+LOWER_ROLES = tuple(f"{MATRIX}.{axes}" for axes in ("yx", "zx", "zy"))
+OFFSET_ROLES = tuple(f"{OFFSET}.{axis}" for axis in AXES)
+CORRECTION_GROUPS = (
+    DIAGONAL_ROLES, UPPER_ROLES, LOWER_ROLES, OFFSET_ROLES,
+    *(tuple(f"{role}.t1" for role in group) for group in (DIAGONAL_ROLES, UPPER_ROLES, LOWER_ROLES, OFFSET_ROLES)),
+    tuple(f"{role}.t2" for role in OFFSET_ROLES),
+)  # fmt: skip
+"""Roles of a correction; a device has all or none of each group. ``.t1`` and ``.t2``
+are per K and per K², about the reference temperature."""
+CORRECTION_ROLES = tuple(role for group in CORRECTION_GROUPS for role in group)
+
 CRC_ROLE, DATE_ROLE, REFERENCE_ROLE = "calibration_crc", "calibration_date", "reference_temperature"
 SERIAL_ROLE, WRITE_COUNTER_ROLE = "serial_number", "write_counter"
 NOT_CALIBRATION = (SERIAL_ROLE, WRITE_COUNTER_ROLE)

@@ -34,6 +34,8 @@ class Habits:
     """A register for CRC-16/MODBUS over the nine, most significant byte first; the master writes it."""
     date: bool = False
     """A register for the calibration date, days since 1970-01-01; not under the checksum."""
+    roles: tuple[str, ...] = ()
+    """In place of the nine: registers of a correction of another form, by their roles."""
     number: Literal["float32", "int32"] = "float32"
     """Type of the nine registers; as int32 in units of 1e-6."""
     serial_type: Literal["uint32", "uint64", "int64"] = "uint32"

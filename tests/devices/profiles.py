@@ -60,6 +60,8 @@ class Wording:
     readings: Literal["before", "after"] | None = None
     """What it says of the readings: before or after the device's own correction."""
     nominal: float = -2.4
+    form: Literal["matrix", "matrix-after"] | None = None
+    output_per_g: float = 1.0
 
 
 def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, wording: Wording | None = None) -> str:
@@ -82,8 +84,11 @@ def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, w
         _table("registers", {name: _register(driver, e, wording) for name, e in registers_of(habits).items()}),
         _table("sequences", _sequences(habits, timing, wording)),
     ]
-    if wording.readings:
-        parts.append(_table("correction", {"readings": wording.readings}))
+    correction = {"readings": wording.readings} if wording.readings else {}
+    if wording.form:
+        correction |= {"form": wording.form, "output_per_g": wording.output_per_g}
+    if correction:
+        parts.append(_table("correction", correction))
     if habits.checksum:
         parts.append(_table("crc", {"register": CHECKSUM, "algorithm": "crc-16/modbus", "over": NINE}))
     return "\n".join(part for part in parts if part)

@@ -83,6 +83,11 @@ def registers_of(habits: Habits) -> dict[str, Entry]:
 
 
 def _calibration(habits: Habits) -> dict[str, Entry]:
+    if habits.roles:
+        return {
+            role.replace(".", "_"): Entry("float32", 0x0100 + 2 * j, (0x2400, 1 + j), "rw", role)
+            for j, role in enumerate(habits.roles)
+        }
     held = {}
     scale = INT32_UNIT if habits.number == "int32" else 1.0
     for i, quantity in enumerate(QUANTITIES):

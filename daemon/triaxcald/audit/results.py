@@ -29,6 +29,7 @@ from triaxcald.outcome import (
     measured_in,
     outcome_document,
 )
+from triaxcald.provision.correction import from_attachments
 from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.raw_to_poses import Pipeline
@@ -84,13 +85,18 @@ class Again:
     def written(self) -> bool:
         """Whether a line that comes to its end writes registers."""
         c = self.certified
+        return c is not None and c.better and self._would_write
+
+    @property
+    def _would_write(self) -> bool:
+        c = self.certified
         return c is not None and c.image is not None and self.station.provisioning.write and c.within_limits
 
     @property
     def checked(self) -> bool:
-        """Whether it then takes check poses; the line of a golden unit does nothing
-        else."""
-        return self.golden is not None or (self.written and td.CORRECTED in self.bundle.profile.streams)
+        """Whether it then takes check poses, also where the device holds nothing worse;
+        the line of a golden unit does nothing else."""
+        return self.golden is not None or (self._would_write and self.bundle.profile.own_output is not None)
 
     def ending(self) -> Ending | None:
         """Of a line that came to its end."""
@@ -147,10 +153,10 @@ def compute(recording: Recording, raw: Digests) -> Again:
     except CANNOT as e:
         why_not = str(e) or repr(e)
     verification = None
-    if raw.verification.records and td.CORRECTED in streams:
+    if raw.verification.records and (own := bundle.profile.own_output) is not None:
         verification = verification_document(
-            verified(tumble[td.CORRECTED], station.reference),
-            verified(check[td.CORRECTED], station.reference),
+            verified(tumble[own], station.reference),
+            verified(check[own], station.reference),
             limit_g=station.limits.verification_rms_g,
             raw_sha256=raw.verification.hexdigest(),
             apart=_apart(recording, tumble[td.READINGS], station),
@@ -203,6 +209,7 @@ def _certified(
         signs=signs,
         computed_with={name: named[name] for name in named if name not in DRAWN_WITH},
         earlier=None if file is None else file.known(),
+        at_start=from_attachments(recording.attachments, recording.name),
     )
 
 

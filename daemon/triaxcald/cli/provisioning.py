@@ -129,6 +129,11 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
     if missing := why_not_written(profile):
         raise tc.Refused(f"{path}: {profile.name}: {missing}")
     logged = tc.interchange.logged_in(document, where=path)
+    if profile.reads_corrected:
+        raise tc.Refused(
+            f"{path}: {profile.name} corrects its readings by the registers that it had, which a calibration file "
+            "does not tell; let triaxcal run calibrate and write it"
+        )
     held = held_by_device(profile, full, logged)
     assert held is not None
     registers = held.registers.calibration
@@ -138,7 +143,7 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
             raise tc.Refused(
                 f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign"
             )
-    return image_of(profile, registers, days_since_1970()), serial
+    return image_of(profile, held, days_since_1970()), serial
 
 
 def _require_little_lost(

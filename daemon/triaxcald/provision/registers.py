@@ -13,6 +13,7 @@ import numpy as np
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.errors import InputError
+from triaxcald.provision.correction import has_form, held_correction
 from triaxcald.provision.identity import read_serial
 
 # What is to be written: a calibration's coefficients as raw register words. No I/O.
@@ -177,6 +178,21 @@ EFFECT_BOUND = 10.0
 """g per g², per K and so on: a larger effect would exceed the measurement itself."""
 
 
+def _bounds_of_form(profile: td.Profile, role: str) -> tuple[float, float]:
+    """Limits of a coefficient of a linear correction in a sound device."""
+    gain = max(map(abs, profile.nominal_diagonal))
+    if role in td.roles.DIAGONAL_ROLES:
+        gain = abs(profile.nominal_diagonal[td.roles.DIAGONAL_ROLES.index(role)])
+        return (-td.SCALE_FACTOR_RATIO * gain, td.SCALE_FACTOR_RATIO * gain)
+    if role.startswith(f"{td.roles.MATRIX}."):
+        return (-td.SCALE_FACTOR_RATIO * gain, td.SCALE_FACTOR_RATIO * gain)
+    per_g = profile.output_per_g
+    if profile.correction is not None and profile.correction.form == "matrix":
+        per_g /= min(map(abs, profile.nominal_diagonal))  # the offset is in the unit of u
+    low, high = BOUNDS[td.roles.BIAS]
+    return low * per_g, high * per_g
+
+
 @dataclass(frozen=True)
 class SanityWarning:
     """Reason why a snapshot is hardly a calibration. ``low`` and ``high`` are the
@@ -222,7 +238,10 @@ def _of(profile: td.Profile, name: str, raw: bytes, wanted: Mapping[str, float])
     if not low <= value <= high:
         return SanityWarning("outside_limits", name, value, low, high)
     role = td.roles.parsed(register.role)
-    if role.quantity == td.roles.SCALE_FACTOR:
+    if role.quantity in td.roles.CORRECTION:
+        low, high = _bounds_of_form(profile, register.role or "")
+        implausible = not low <= value <= high
+    elif role.quantity == td.roles.SCALE_FACTOR:
         nominal = profile.output.nominal_scale_factor
         size = abs(nominal[role.axis] if nominal else wanted.get(name, math.nan))
         low, high = size / td.SCALE_FACTOR_RATIO, size * td.SCALE_FACTOR_RATIO
@@ -289,7 +308,11 @@ def departure_g(
     """Median distance in g of the ``corrected`` output (n,3) from what the
     registers make of the ``readings`` (n,3) of the same moments; ``channels``
     (n,) each. None where that cannot be told."""
-    if len(readings) < LEAST or (described := sensor_in(profile, snapshot)) is None:
+    if len(readings) < LEAST:
+        return None
+    if has_form(profile):
+        return _departure_of_form(profile, snapshot, readings, corrected, channels)
+    if (described := sensor_in(profile, snapshot)) is None:
         return None
     sensor, reference_c = described
     covariates = {"temp_c": channels["temp_c"] - reference_c} if "temp_c" in channels else {}
@@ -300,6 +323,21 @@ def departure_g(
     except tc.Refused:
         return None
     return float(np.median(np.linalg.norm(corrected - expected, axis=1)))
+
+
+def _departure_of_form(
+    profile: td.Profile,
+    snapshot: Snapshot,
+    readings: tc.Floats,
+    corrected: tc.Floats,
+    channels: Mapping[str, tc.Floats],
+) -> float | None:
+    held = held_correction(profile, snapshot.raw)
+    if held is None or (held.thermal and "temp_c" not in channels):
+        return None
+    temperature_c = channels.get("temp_c", np.full(len(readings), held.reference_c))
+    off = (corrected - held.output(readings, temperature_c)) / held.output_per_g
+    return float(np.median(np.linalg.norm(off, axis=1)))
 
 
 def departure_warnings(off_g: float | None) -> list[SanityWarning]:
@@ -358,6 +396,9 @@ def _correcting(profile: td.Profile) -> tuple[str, ...]:
 def _is_neutral(profile: td.Profile, name: str, raw: bytes) -> bool:
     register, value = profile.registers[name], profile.decode(name, raw)
     role = td.roles.parsed(register.role)
+    if register.role in td.roles.DIAGONAL_ROLES:
+        gain = profile.nominal_diagonal[td.roles.DIAGONAL_ROLES.index(register.role)]
+        return any(abs(value - n) <= td.registers.step(register, n) * (1 + 1e-9) for n in (gain, abs(gain), 1.0))
     if role.quantity != td.roles.SCALE_FACTOR:
         return value == _nearest(profile, name, 0.0)
     # The device divides by it. Who wrote the nominal one may have rounded it

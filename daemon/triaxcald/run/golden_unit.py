@@ -64,6 +64,7 @@ class GoldenCheck:
     under the calibration of ``file``. ``limit_g`` and ``apart_deg`` are those of the
     station, ``reference`` is in g."""
 
+    own_output: str | None
     file: EarlierFile | None
     limit_g: float | None
     apart_deg: float
@@ -71,7 +72,7 @@ class GoldenCheck:
 
     @property
     def stream(self) -> str:
-        return td.CORRECTED if self.file is None else td.READINGS
+        return self.own_output if self.file is None and self.own_output is not None else td.READINGS
 
     @property
     def record(self) -> dict[str, str]:
@@ -85,7 +86,8 @@ class GoldenCheck:
             return None
         file = golden_calibration(station)
         assert file is not None
-        if td.CORRECTED in place.bundle.profile.streams:
+        own_output = place.bundle.profile.own_output
+        if own_output is not None:
             file = None
         else:
             file.require_of(
@@ -96,7 +98,7 @@ class GoldenCheck:
                 output_unit=place.bundle.profile.output.unit,
             )
             file.require_channels(place)
-        return _check(file, station.file)
+        return _check(own_output, file, station.file)
 
     @staticmethod
     def of_recording(recording: Recording, station: StationFile, bundle: td.Bundle) -> GoldenCheck | None:
@@ -111,17 +113,17 @@ class GoldenCheck:
         if record is None:
             return None
         name = record.get("calibration")
-        own_output = td.CORRECTED in bundle.profile.streams
-        if (name is None) != (ATTACHMENT not in recording.attachments) or (name is None) != own_output:
+        own_output = bundle.profile.own_output
+        if (name is None) != (ATTACHMENT not in recording.attachments) or (name is None) != (own_output is not None):
             raise RecordingError(f"attachment {ATTACHMENT}: not as metadata {RECORD} and the profile have it")
         file = None if name is None else EarlierFile.parsed(recording.attachments[ATTACHMENT], name)
-        return _check(file, station)
+        return _check(own_output, file, station)
 
     def verify(self, pipelines: Mapping[str, Pipeline]) -> Verification:
         """Finishes the pipeline. Raises InputError if the calibration gives no finite
         errors, InvalidData if a channel is missing."""
         if self.file is None:
-            return verified(pipelines[td.CORRECTED], self.reference)
+            return verified(pipelines[self.stream], self.reference)
         pipeline, model = pipelines[td.READINGS], self.file.calibration.fitted
         found = under_calibration(pipeline, model, self.reference)
         if not found.is_finite:
@@ -151,5 +153,5 @@ def require_trusted(poses: Sequence[tc.Pose]) -> None:
         raise tc.Refused(f"no check pose can be trusted: {len(poses)} left out ({faults})")
 
 
-def _check(file: EarlierFile | None, station: StationFile) -> GoldenCheck:
-    return GoldenCheck(file, station.limits.verification_rms_g, station.plan.apart_deg, station.reference)
+def _check(own_output: str | None, file: EarlierFile | None, station: StationFile) -> GoldenCheck:
+    return GoldenCheck(own_output, file, station.limits.verification_rms_g, station.plan.apart_deg, station.reference)

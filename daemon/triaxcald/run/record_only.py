@@ -471,6 +471,14 @@ class UnitRecording(AtRecording):
         super().leave()
         self._session.leave()
 
+    async def _correcting_registers(self, device: td.Device) -> dict[str, bytes] | None:
+        """Those of the session; a device that refuses them is recorded all the same."""
+        try:
+            return await self._session.correcting_registers(device)
+        except td.RegisterRefused as e:
+            self._progress.note(self.name, f"warning: the registers that correct the readings are not recorded: {e}")
+            return None
+
     async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         session, found = self._session, list[IdentityRead]()
 
@@ -492,5 +500,6 @@ class UnitRecording(AtRecording):
                 finally:
                     self._wrong, self._unconfirmed = confirmation.wrong, confirmation.unconfirmed
 
-            make = partial(session.writer, self._path, identity, segments=self._segments)
+            at_start = await self._correcting_registers(device)
+            make = partial(session.writer, self._path, identity, segments=self._segments, at_start=at_start)
             await self._recorded_by(make, record, self._path if self._segments else None)

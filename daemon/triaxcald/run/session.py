@@ -14,6 +14,7 @@ import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.correction import AT_START, correcting_registers, to_bytes
 from triaxcald.provision.identity import IdentityRead, identified
 from triaxcald.provision.registers import Snapshot, take_snapshot
 from triaxcald.recording.manifest import SEGMENT_BYTES, SEGMENT_S, Retention
@@ -134,6 +135,14 @@ class UnitSession:
         DriverError."""
         return await take_snapshot(RegisterLink(device, self.profile, name=self.place.device_name), self.place.bundle)
 
+    async def correcting_registers(self, device: td.Device) -> dict[str, bytes] | None:
+        """The registers by which the device corrects its readings now, where its
+        profile has a form of correction. Raises WrongUnit, DriverError."""
+        if not (names := correcting_registers(self.profile)):
+            return None
+        link = RegisterLink(device, self.profile, name=self.place.device_name)
+        return dict((await take_snapshot(link, self.place.bundle, names)).raw)
+
     def recording_name(self, identity: IdentityRead) -> str:
         return f"{self.name}-{identity.serial or 'unknown'}-{file_stamp(self.clock_ns())}.mcap"
 
@@ -153,9 +162,10 @@ class UnitSession:
         ends_with: str = "",
         segments: Segments | None = None,
         more: Mapping[str, Mapping[str, str]] | None = None,
+        at_start: Mapping[str, bytes] | None = None,
     ) -> RecordingWriter:
-        """A writer with station file and profile attached, and ``more`` metadata.
-        Raises RecordingError."""
+        """A writer with station file, profile and the registers ``at_start`` attached,
+        and ``more`` metadata. Raises RecordingError."""
         unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
         settings: dict[str, Any] = {
             "metadata": {
@@ -175,4 +185,6 @@ class UnitSession:
         writer.attach(PROFILE_FILE, "application/toml", self.place.bundle.text)
         for name, data in self.place.bundle.files.items():
             writer.attach(f"profile/{name}", "application/octet-stream", data)
+        if at_start is not None:
+            writer.attach(AT_START, "application/json", to_bytes(at_start))
         return writer

@@ -153,6 +153,7 @@ class UnitRun(UnitSession):
         self._write_back: WriteBack | None = None
         self._golden: GoldenCheck | None = None
         self._golden_verification: tc.interchange.Document | None = None
+        self._at_start: dict[str, bytes] | None = None
         self._document: tc.interchange.Document | None = None
         self._lost = 0
 
@@ -183,8 +184,11 @@ class UnitRun(UnitSession):
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
                 self._require_readable_journal(identity)
                 await self._require_readings_before(device)
+                self._at_start = await self.correcting_registers(device)
                 await self._note(recording=path.name)
-                with self.writer(path, identity, ends_with=FORMAT, more=self._records) as writer:
+                with self.writer(
+                    path, identity, ends_with=FORMAT, more=self._records, at_start=self._at_start
+                ) as writer:
                     self._recording = path
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
@@ -502,7 +506,7 @@ class UnitRun(UnitSession):
         poses = await asyncio.to_thread(acquisition.pipelines[td.READINGS].finish)
         certified = self._certified = await asyncio.to_thread(self._certify, acquisition, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
-            await self._write(device, writer, certified.image, identity, acquisition)
+            await self._write(device, writer, certified, certified.image, identity, acquisition)
         ending = judged(
             certified.document,
             self._write_back.verification if self._write_back else None,
@@ -524,6 +528,7 @@ class UnitRun(UnitSession):
         self,
         device: td.Device,
         writer: RecordingWriter,
+        certified: Certified,
         image: RegisterImage,
         identity: IdentityRead,
         acquisition: Collection,
@@ -537,7 +542,8 @@ class UnitRun(UnitSession):
             reconnecting = self.reconnecting(device, identity, policy, confirmation=confirmation)
             async with confirmation.phase():
                 await confirmation.ask()
-                await self._collect(reconnecting, writer, check, td.CORRECTED, plan.check_poses, fitted)
+                assert self.profile.own_output is not None
+                await self._collect(reconnecting, writer, check, self.profile.own_output, plan.check_poses, fitted)
 
         self._write_back = WriteBack(
             self.place,
@@ -549,8 +555,13 @@ class UnitRun(UnitSession):
             on_settled=self._settled,
             started=iso_time(self.clock_ns(), "seconds"),
             force=self.force,
+            at_start=self._at_start,
         )
         assert self._confirmation is not None
+        if not certified.better:
+            writer.event("not_written", {"reason": "the device holds nothing worse"})
+            await self._write_back.check_alone(acquisition)
+            return
         async with self._confirmation.phase():  # the unit may have been silent when the poses ended
             self.progress.stage(self.name, Stage.WRITING)
             examined = await self._write_back.examine(device, image, identity.serial, acquisition)
@@ -573,6 +584,7 @@ class UnitRun(UnitSession):
             signs=self.place.signs,
             computed_with=software(),
             earlier=None if self.rezero is None else self.rezero.known(),
+            at_start=self._at_start,
         )
 
     async def _collect(
@@ -585,13 +597,14 @@ class UnitRun(UnitSession):
         apart_from: tc.Floats | None = None,
     ) -> None:
         plan, targets, on_demand = self.station.file.plan, None, None
+        calibrating = collection.phase == CALIBRATION
         if self._golden is not None:
             plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
-        elif self.rezero is None and stream == td.READINGS and plan.stop is not None:
+        elif self.rezero is None and calibrating and plan.stop is not None:
             judge = Judge.of(plan.stop, self.place, self.station.file)
             on_demand = OnDemand(judge, repeat=plan.repeat, tell=partial(self._judged, writer))
             targets = on_demand.targets
-        elif self.rezero is not None and stream == td.READINGS:
+        elif self.rezero is not None and calibrating:
             plan, targets = plan.model_copy(update={"repeat": False}), tc.planning.bias_directions(wanted)
         if self.tray is not None:
             targets = (
@@ -606,7 +619,7 @@ class UnitRun(UnitSession):
             stream=stream,
             wanted=wanted,
             targets=targets,
-            nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == td.READINGS else (1, 1, 1),
+            nominal_scale_factor=self.profile.nominal_of(stream),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
             on_demand=on_demand,
@@ -629,7 +642,8 @@ class UnitRun(UnitSession):
             there = self.reconnecting(device, identity, RetryPolicy(most_s=0.0), confirmation=confirmation)
             wanted = self.station.file.plan.check_poses
             async with confirmation.phase():
-                await self._collect(there, None, check, td.CORRECTED, wanted)
+                assert self.profile.own_output is not None  # as the command has made sure
+                await self._collect(there, None, check, self.profile.own_output, wanted)
             return corrected(check, self.station.file.reference)
 
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:

@@ -61,8 +61,9 @@ class WriteBack:
 
     ``collect`` collects check poses, ``ask`` instructs the operator; ``force`` is
     the reason to continue in spite of `warnings`; ``run`` is the id of the run, and
-    ``on_settled`` as in `Provisioning`. ``verdict`` is that on the
-    device's own output, None before it is judged.
+    ``on_settled`` as in `Provisioning`. ``at_start`` are the registers by which the
+    device corrected the readings of the calibration, if it did. ``verdict`` is that
+    on the device's own output, None before it is judged.
     """
 
     place: Place
@@ -73,6 +74,7 @@ class WriteBack:
     started: str
     force: str | None = None
     run: str = field(default_factory=new_run_id)
+    at_start: Mapping[str, bytes] | None = None
     on_settled: Callable[[Held], None] = lambda _: None
     verification: tc.interchange.Document | None = field(default=None, init=False)
     verdict: str | None = field(default=None, init=False)
@@ -102,6 +104,7 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
+        self._require_unchanged(p)
         self.warnings = [*p.warnings, *await asyncio.to_thread(self._output_warnings, acquisition)]
         if self.warnings and self.force is None:
             raise Implausible(text.refused_by_sanity_warnings(self.warnings))
@@ -109,6 +112,25 @@ class WriteBack:
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
         return p
+
+    def _require_unchanged(self, p: Provisioning) -> None:
+        """Raises Refused if somebody has written registers since the readings began."""
+        changed = p.found.differing(self.at_start or {})
+        if changed and not p.carried:
+            raise tc.Refused(
+                f"the register{'s' if len(changed) > 1 else ''} {', '.join(changed)} changed since the readings began, "
+                "which were corrected by them; nothing was written: measure again"
+            )
+
+    async def check_alone(self, acquisition: Collection) -> None:
+        """Verify the output of a device in which nothing is to be written. Raises
+        StationError, DiskError."""
+        try:
+            self.verdict = await self._verify(acquisition)
+        except (DiskError, WrongUnit, TwoAnswer):
+            raise
+        except (td.DriverError, DaemonError, tc.TriaxcalError) as e:
+            raise StationError(f"verification failed: {e}") from e
 
     async def write(self, p: Provisioning, acquisition: Collection) -> None:
         """Write and verify. Before any error is raised the old calibration is restored,
@@ -155,7 +177,7 @@ class WriteBack:
 
     async def _verify(self, acquisition: Collection) -> str:
         """Verify the device's own output in check poses; the verdict."""
-        if td.CORRECTED not in self.place.bundle.profile.streams:
+        if self.place.bundle.profile.own_output is None:
             return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
@@ -188,7 +210,9 @@ class WriteBack:
 
 def corrected(collection: Collection, reference: float) -> Verification:
     """The device's own output in the poses of a collection."""
-    return verified(collection.pipelines[td.CORRECTED], reference)
+    stream = collection.bundle.profile.own_output
+    assert stream is not None
+    return verified(collection.pipelines[stream], reference)
 
 
 def _alignments(readings: Sequence[tc.Pose], outputs: Sequence[tc.Pose]) -> Iterator[list[tuple[tc.Pose, tc.Pose]]]:

@@ -68,6 +68,13 @@ class RegisterWord(tc.schema.Model):
     unit: Annotated[str, Field(description="unit of the values")]
 
 
+class OwnError(tc.schema.Model):
+    before: Annotated[tc.schema.Figure | None, Field(description="under the registers that the device had [g]")]
+    predicted: Annotated[
+        tc.schema.Figure | None, Field(description="under the new ones, with the uncertainty of the calibration [g]")
+    ]
+
+
 class RegistersOfCertificate(tc.schema.Model):
     terms: Annotated[list[str], Field(description="`linear`, and the effects that the registers correct")]
     left_to_host: Annotated[list[str], Field(description="effects that the device has no registers for")]
@@ -87,6 +94,27 @@ class RegistersOfCertificate(tc.schema.Model):
         Field(description="[uncertainty](../explanation/uncertainty.md) of the calibration in the registers"),
     ]
     words: Annotated[list[RegisterWord], Field(description="the registers, in the order of the profile")]
+    fixed: Annotated[
+        list[str],
+        Field(
+            default_factory=list,
+            description="coefficients of the device's correction without a register; these five keys are absent "
+            "without `[correction] form`",
+        ),
+    ]
+    left_rms_g: Annotated[
+        tc.schema.Figure | None, Field(description="rms error of |a| that their lack leaves, over the sphere [g]")
+    ] = None
+    left_largest_g: Annotated[tc.schema.Figure | None, Field(description="largest error that it leaves [g]")] = None
+    own_rms_g: Annotated[OwnError | None, Field(description="rms error of the device's own output over the sphere")] = (
+        None
+    )
+    better: Annotated[
+        bool | None,
+        Field(
+            description="whether the prediction beats the device by more than it may be wrong; else nothing is written"
+        ),
+    ] = None
 
 
 class Certificate(tc.schema.Model):

@@ -263,7 +263,8 @@ class Collection(Recorded):
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
         lost_s = self.gaps_s  # the time of an interruption does not count as time without a pose
         counted_s: tuple[float, ...] = ()
-        if stream == td.READINGS and targets is None:
+        planned = stream == td.READINGS and apart_from is None
+        if planned and targets is None:
             tc.planning.directions(wanted)  # computed once, before samples can get lost
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
@@ -284,8 +285,8 @@ class Collection(Recorded):
                     apart_deg=plan.apart_deg,
                     now_s=now_s,
                     nominal_scale_factor=nominal_scale_factor,
-                    plan=stream == td.READINGS,
-                    repeat=plan.repeat and stream == td.READINGS,
+                    plan=planned,
+                    repeat=plan.repeat and planned,
                     counted_s=counted_s,
                     apart_from=apart_from,
                     targets=targets,

@@ -500,7 +500,7 @@ def load_station(path: Path) -> Station:
         driver = td.driver_named(bundle.profile.driver, where=str(path))
         bus = td.toml_text.validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
         judged = file.limits.verification_rms_g is not None and file.rules.golden is None  # which needs the limit too
-        if judged and td.CORRECTED not in bundle.profile.streams:
+        if judged and bundle.profile.own_output is None:
             raise InputError(
                 f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
             )
@@ -530,7 +530,7 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
 def _check_roles(bundle: td.Bundle, *, where: str) -> None:
     """Check the roles of a profile; coefficients of effects are roles too, and only the
     daemon knows them. Raises InputError with the nearest role."""
-    known = list(td.roles.LINEAR_ROLES)
+    known = [*td.roles.LINEAR_ROLES, *td.roles.CORRECTION_ROLES]
     if any(r.role not in (None, *known, *td.roles.OTHER_ROLES) for r in bundle.profile.registers.values()):
         known += [f"{e.name}.{c.name}" for e in tc.effects.CATALOGUE for c in e.coefficients]
     known += td.roles.OTHER_ROLES
