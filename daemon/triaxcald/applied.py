@@ -14,6 +14,7 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.decoded import DecodedStream
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
+from triaxcald.provision.correction import from_attachments, samples_before
 from triaxcald.recording.reader import is_recording, open_recording
 from triaxcald.recording.schema import Phase
 from triaxcald.tables.native_csv import Rows
@@ -144,6 +145,9 @@ def _of_another_unit(calibration: tc.Calibration, name: str, lengths: list[float
 
 def _of_recording(path: Path, phase: Phase) -> Iterator[td.SampleBlock]:
     with open_recording(path) as recording:
-        stream = DecodedStream(bundle_of(recording), td.READINGS)
+        bundle = bundle_of(recording)
+        stream = DecodedStream(bundle, td.READINGS)
+        at_start = from_attachments(recording.attachments, recording.name)
         for batch in recording.raw(phase):
-            yield stream.rising(batch)
+            # A calibration is of the readings before the device's own correction.
+            yield samples_before(bundle.profile, stream.rising(batch), at_start)

@@ -37,7 +37,7 @@ from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
 
 if TYPE_CHECKING:  # the models are loaded when a document is made
-    from triaxcald.schema.certificate import RegistersOfCertificate
+    from triaxcald.schema.certificate import CorrectionOfCertificate, RegistersOfCertificate
 
 DAY_S = 86_400
 TEMPERATURE = "temp_c"
@@ -265,9 +265,9 @@ def _registers_part(
         stated = replace(stated, rounding=_steps(image), not_held=held.registers.cost)
         of_form = {}
     else:
-        rounding_rms = held.correction.rounding_rms(_rounded(image, held.correction))
+        rounding_rms = rounding_of(image, held.correction)
         stated = replace(stated, not_held=float(np.hypot(held.registers.cost, rounding_rms)))
-        of_form = _of_form(image, held.correction)
+        of_form = vars(of_correction(image, held.correction))
     budget = tc.uncertainty.budget(registers, stated)
     return RegistersOfCertificate(
         **of_form,
@@ -292,20 +292,25 @@ def _registers_part(
     )
 
 
-def _of_form(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> dict[str, Any]:
+def of_correction(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> CorrectionOfCertificate:
     """What a device with a form of correction leaves, and gains."""
-    from triaxcald.schema.certificate import OwnError
+    from triaxcald.schema.certificate import CorrectionOfCertificate, OwnError
 
     rounded = _rounded(image, found)
-    return {
-        "fixed": [role for role in td.roles.CORRECTION_ROLES[:12] if role not in found.free],
-        "left_rms_g": tc.rounding.error(found.left_rms),
-        "left_largest_g": tc.rounding.error(found.left_largest),
-        "own_rms_g": OwnError(
+    return CorrectionOfCertificate(
+        fixed=[role for role in td.roles.CORRECTION_ROLES[:12] if role not in found.free],
+        left_rms_g=tc.rounding.error(found.left_rms),
+        left_largest_g=tc.rounding.error(found.left_largest),
+        own_rms_g=OwnError(
             before=tc.rounding.error(found.own_rms), predicted=tc.rounding.error(found.predicted_rms(rounded))
         ),
-        "better": found.better(rounded),
-    }
+        better=found.better(rounded),
+    )
+
+
+def rounding_of(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> float:
+    """rms change of |a| [g] by rounding to the registers of the correction."""
+    return found.rounding_rms(_rounded(image, found))
 
 
 def _rounded(image: RegisterImage, found: tc.estimate.DeviceCorrection) -> tc.estimate.LinearCorrection:

@@ -17,7 +17,7 @@ from triaxcald import text
 from triaxcald.decoded import DecodedStream
 from triaxcald.documents import TooManyContainers, json_value
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.provision.correction import from_attachments, removed_from
+from triaxcald.provision.correction import from_attachments, removed_from, samples_before
 from triaxcald.provision.identity import same_serial
 from triaxcald.raw_to_poses import Pipeline, of_poses, together
 from triaxcald.recording.bus import require_of_unit
@@ -43,8 +43,9 @@ class Measured:
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the
     recording was made with, where it says; ``unit`` is its name and serial;
     ``output_unit`` what the header of a table says. ``remarks`` say how a table
-    was read. ``parted`` gives the same for another ``turn_s``, as for
-    `find_spans`; None where poses are all that was read.
+    was read. ``at_start`` are the registers by which the device corrected the
+    readings; the poses are of the readings before that. ``parted`` gives the same
+    for another ``turn_s``, as for `find_spans`; None where poses are all that was read.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Measured:
     unit: Mapping[str, str] | None = None
     stated: tc.Stated | None = None
     holds_at: tc.Moment | float | None = None
+    at_start: Mapping[str, bytes] | None = None
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
     too_short: tc.TooShort | None = None
@@ -146,11 +148,13 @@ def _measure_recording(
 ) -> Measured:
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
+    at_start = from_attachments(recording.attachments, recording.name)
     used = 0
     for batch in recording.raw(phase):
         used += len(batch)
         block = pipeline.rising(batch)
         if moments is not None:
+            block = samples_before(bundle.profile, block, at_start)
             moments.feed(block.readings, block.channels.get(tc.effects.TEMPERATURE))
     pipeline.close()
     lost = losses_of(recording)
@@ -166,11 +170,9 @@ def _measure_recording(
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
     read = Measured(
-        recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at,
+        recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at, at_start,
         too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
     )  # fmt: skip
-
-    at_start = from_attachments(recording.attachments, recording.name)
 
     def parted(turn_s: float | None) -> Measured:
         poses = pipeline.parted(turn_s)

@@ -350,3 +350,26 @@ def refused_by_sanity_warnings(of: Sequence[SanityWarning]) -> str:
         f"what the device holds is no calibration under its profile (word order, scaling, addresses?): {listed}{more}; "
         "nothing was written; --force REASON writes all the same"
     )
+
+
+def of_correction(figures: Mapping[str, Any], rounding_rms_g: float | None) -> list[str]:
+    """What the registers of a device's own correction leave and gain: the figures of
+    `CorrectionOfCertificate`."""
+    lines = []
+    if fixed := figures.get("fixed"):
+        lines.append(
+            f"no register for {', '.join(fixed)}: that leaves |a| off by {_micro(figures.get('left_rms_g'))} rms, "
+            f"{_micro(figures.get('left_largest_g'))} at most"
+        )
+    own = figures.get("own_rms_g") or {}
+    lines.append(
+        f"|a| of the device's own output: off by {_micro(own.get('before'))} rms with the old registers, "
+        f"{_micro(own.get('predicted'))} predicted with the new, of which rounding is {_micro(rounding_rms_g)}"
+    )
+    if figures.get("better") is False:
+        lines.append("the new registers are no better than the old by more than the uncertainty of the prediction")
+    return lines
+
+
+def _micro(value_g: float | None) -> str:
+    return "unknown" if value_g is None else tc.number_format.micro_g(value_g)

@@ -322,3 +322,10 @@ class Calibration(Model):
         ),
     ]
     unit: Annotated[UnitOfCalibration | None, Field(description="the unit, of a station's recording")] = None
+    registers_at_start: Annotated[
+        dict[Text, Text] | None,
+        Field(
+            description="registers by which the device corrected the recorded readings, bytes as hexadecimal; absent "
+            "of a device whose profile has no form of correction"
+        ),
+    ] = None

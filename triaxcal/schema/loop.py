@@ -199,6 +199,13 @@ class Loop(Model):
         list[RecordingOfLoop], Field(default_factory=list, description="errors in each of several; absent of one")
     ]
     unit: Annotated[UnitOfCalibration | None, Field(description="the unit, of a station's recording")] = None
+    registers_at_start: Annotated[
+        dict[Text, Text] | None,
+        Field(
+            description="registers by which the device corrected the recorded readings, bytes as hexadecimal; absent "
+            "of a device whose profile has no form of correction"
+        ),
+    ] = None
 
 
 class Rezero(Model):

@@ -36,6 +36,7 @@ from triaxcald.earlier_calibration import EarlierFile
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, read_document, require_unit
+from triaxcald.provision.correction import IN_DOCUMENT, to_hex
 from triaxcald.verification import unlike
 
 # fit by other ways: a turning unit, poses of known attitude, refinement of
@@ -625,6 +626,8 @@ def write_results(
     place."""
     if measured.unit:
         document["unit"] = dict(measured.unit)  # so that it cannot be written to another
+    if measured.at_start:
+        document[IN_DOCUMENT] = to_hex(measured.at_start)  # what the device must still hold when it is written
     if a.report:  # before anything is written
         from triaxcald.report.charts import overview_of
         from triaxcald.report.page import render_report  # matplotlib, which nothing else needs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.caveats import is_passing
-from triaxcald.certificate import held_by_device, image_of, why_not_written
+from triaxcald.certificate import held_by_device, image_of, of_correction, rounding_of, why_not_written
 from triaxcald.cli.console import emit, say, show, showing, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
+from triaxcald.provision.correction import IN_DOCUMENT, from_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import RegisterImage
@@ -31,17 +33,25 @@ def provision_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     _settle_killed(station)
     place = station.place(a.unit)
-    image, serial = (None, None) if a.resume else image_from(a.calibration, place)
+    wanted = None if a.resume else wanted_by(a.calibration, place)
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
-    run = ProvisionRun(station, place, image, serial, dry_run=a.dry_run, force=a.force, ask=ask)
+    run = ProvisionRun(station, place, dry_run=a.dry_run, force=a.force, ask=ask)
+    if wanted is not None:
+        run = ProvisionRun(
+            station, place, wanted.image, wanted.serial,
+            dry_run=a.dry_run, force=a.force, ask=ask, at_start=wanted.at_start,
+        )  # fmt: skip
     done = run_interruptible(run.run())
     if done.error is not None:
         say(f"triaxcal: {done.error}")
     with showing(done.exit_code, _told(done, station.path)):
         if a.json:
-            emit(_document(done, place, dry_run=a.dry_run))
+            emit(_document(done, place, wanted, dry_run=a.dry_run))
         elif done.error is None:
             _show(done, place, station.path, dry_run=a.dry_run)
+            if wanted is not None and wanted.correction is not None:
+                for line in text.of_correction(wanted.correction, wanted.rounding_rms_g):
+                    show(line)
     return done.exit_code
 
 
@@ -63,8 +73,11 @@ def _ask(stage: Stage, what: str) -> None:
     say(what)
 
 
-def _document(done: Provisioned, place: Place, *, dry_run: bool) -> dict[str, Any]:
+def _document(done: Provisioned, place: Place, wanted: Wanted | None, *, dry_run: bool) -> dict[str, Any]:
     p = done.provisioning
+    of_correction = {}
+    if wanted is not None and wanted.correction is not None:
+        of_correction = {"correction": {**wanted.correction, "rounding_rms_g": wanted.rounding_rms_g}}
     return {
         "format": "triaxcal.provisioning/1",
         "unit": place.unit.name,
@@ -75,6 +88,7 @@ def _document(done: Provisioned, place: Place, *, dry_run: bool) -> dict[str, An
         "stored": bool(p and p.stored),
         "error": done.error,
         "words": _words(p) if p else [],
+        **of_correction,
         "outcome": done.document,
         "outcome_file": str(done.path) if done.path else None,
     }
@@ -112,7 +126,20 @@ def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> N
         show(f"outcome {done.path}")
 
 
-def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
+@dataclass(frozen=True)
+class Wanted:
+    """What a calibration file asks for: ``image`` in the unit ``serial``, which still
+    holds ``at_start``, by which it corrected the readings. ``correction`` are the
+    figures of a certificate for a device with a form of correction."""
+
+    image: RegisterImage
+    serial: str | None
+    at_start: Mapping[str, bytes] | None = None
+    correction: Mapping[str, Any] | None = None
+    rounding_rms_g: float | None = None
+
+
+def wanted_by(path: str, place: Place) -> Wanted:
     """The registers that a calibration file asks for, and the serial number of
     the unit that it is meant for.
 
@@ -129,12 +156,13 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
     if missing := why_not_written(profile):
         raise tc.Refused(f"{path}: {profile.name}: {missing}")
     logged = tc.interchange.logged_in(document, where=path)
-    if profile.reads_corrected:
+    at_start = from_document(document, path)
+    if profile.reads_corrected and at_start is None:
         raise tc.Refused(
-            f"{path}: {profile.name} corrects its readings by the registers that it had, which a calibration file "
-            "does not tell; let triaxcal run calibrate and write it"
+            f"{path}: {profile.name} corrects its readings by its registers, and the file has no {IN_DOCUMENT}: fit a "
+            "recording of triaxcal, or let triaxcal run calibrate and write the unit"
         )
-    held = held_by_device(profile, full, logged)
+    held = held_by_device(profile, full, logged, at_start)
     assert held is not None
     registers = held.registers.calibration
     _require_little_lost(document, full, held.registers, path, profile, logged)
@@ -143,7 +171,11 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
             raise tc.Refused(
                 f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign"
             )
-    return image_of(profile, held, days_since_1970()), serial
+    image = image_of(profile, held, days_since_1970())
+    if held.correction is None:
+        return Wanted(image, serial)
+    figures, rounding = of_correction(image, held.correction), rounding_of(image, held.correction)
+    return Wanted(image, serial, at_start, figures.document(), tc.rounding.error(rounding))
 
 
 def _require_little_lost(

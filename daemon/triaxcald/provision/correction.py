@@ -6,14 +6,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.errors import RecordingError
+from triaxcald.errors import InputError, RecordingError
 
 AT_START = "registers-at-start.json"
 """Attachment of a recording: the registers by which the device corrected its
 readings."""
+IN_DOCUMENT = "registers_at_start"
+"""Key of the same in a calibration document."""
 
 
 def has_form(profile: td.Profile) -> bool:
@@ -70,6 +76,11 @@ def removed_from(profile: td.Profile, poses: list[tc.Pose], raw: Mapping[str, by
     that cannot be told."""
     if not profile.reads_corrected:
         return poses
+    return tc.estimate.uncorrected(poses, _known(profile, raw))
+
+
+def _known(profile: td.Profile, raw: Mapping[str, bytes] | None) -> tc.estimate.LinearCorrection:
+    """The correction in recorded readings. Raises Refused."""
     if not raw:
         raise tc.Refused(
             f"the readings are corrected by the device's registers, and the recording has no {AT_START}: what it read "
@@ -78,7 +89,18 @@ def removed_from(profile: td.Profile, poses: list[tc.Pose], raw: Mapping[str, by
     held = held_correction(profile, raw)
     if held is None:
         raise tc.Refused("a calibration register of the device holds no number: its output does not tell the reading")
-    return tc.estimate.uncorrected(poses, held)
+    return held
+
+
+def require_unchanged(raw: Mapping[str, bytes], at_start: Mapping[str, bytes] | None) -> None:
+    """Raises Refused if registers of the device, ``raw``, were written since the
+    readings began that were corrected by them."""
+    changed = [name for name, data in (at_start or {}).items() if name in raw and raw[name] != data]
+    if changed:
+        raise tc.Refused(
+            f"the register{'s' if len(changed) > 1 else ''} {', '.join(changed)} changed since the readings began, "
+            "which were corrected by them; nothing was written: measure again"
+        )
 
 
 def start_of_fit(profile: td.Profile, raw: Mapping[str, bytes] | None) -> tc.estimate.LinearCorrection:
@@ -122,9 +144,28 @@ def with_values(correction: tc.estimate.LinearCorrection, held: Mapping[str, flo
     )  # fmt: skip
 
 
+def samples_before(profile: td.Profile, block: td.SampleBlock, raw: Mapping[str, bytes] | None) -> td.SampleBlock:
+    """Samples of the readings before the device's correction, as `removed_from` has
+    poses. Raises Refused."""
+    if not profile.reads_corrected or not len(block):
+        return block
+    held = _known(profile, raw)
+    temperature = block.channels.get(tc.effects.TEMPERATURE)
+    if temperature is None and held.thermal:
+        raise tc.Refused("the device corrects by temperature, and its readings have none")
+    at_c = np.full(len(block), held.reference_c) if temperature is None else temperature
+    return replace(
+        block, readings=held.before(block.readings, np.asarray(at_c, dtype=np.float64))[0].astype(np.float64)
+    )
+
+
+def to_hex(raw: Mapping[str, bytes]) -> dict[str, str]:
+    return {name: data.hex() for name, data in raw.items()}
+
+
 def to_bytes(raw: Mapping[str, bytes]) -> bytes:
     """As attached to a recording."""
-    return (json.dumps({name: data.hex() for name, data in raw.items()}, indent=2) + "\n").encode()
+    return (json.dumps(to_hex(raw), indent=2) + "\n").encode()
 
 
 def from_attachments(attachments: Mapping[str, bytes], where: str) -> dict[str, bytes] | None:
@@ -132,7 +173,22 @@ def from_attachments(attachments: Mapping[str, bytes], where: str) -> dict[str, 
     if AT_START not in attachments:
         return None
     try:
-        found = json.loads(attachments[AT_START])
-        return {str(name): bytes.fromhex(data) for name, data in found.items()}
+        return from_hex(json.loads(attachments[AT_START]))
     except (ValueError, TypeError, AttributeError) as e:
         raise RecordingError(f"{where}: {AT_START}: not registers as hexadecimal bytes") from e
+
+
+def from_document(document: Mapping[str, Any], where: str) -> dict[str, bytes] | None:
+    """Of a calibration document; None where it has none. Raises InputError."""
+    if (held := document.get(IN_DOCUMENT)) is None:
+        return None
+    try:
+        return from_hex(held)
+    except (ValueError, TypeError, AttributeError) as e:
+        raise InputError(f"{where}: {IN_DOCUMENT}: not registers as hexadecimal bytes") from e
+
+
+def from_hex(held: Any) -> dict[str, bytes]:
+    """Raises ValueError, TypeError or AttributeError for anything but bytes by
+    register."""
+    return {str(name): bytes.fromhex(data) for name, data in held.items()}

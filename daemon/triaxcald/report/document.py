@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import triaxcal as tc
+from triaxcald import text
 from triaxcald.caveats import is_passing
 from triaxcald.report.figures import QUALITY, clean, micro_g, number
 from triaxcald.schema.certificate import RegisterWord
@@ -560,7 +561,9 @@ def left_out(poses: Sequence[Pose], unit: tc.units.ErrorUnit) -> tuple[str, ...]
 class Device:
     """Effects: ``held`` are in its registers, for ``host`` it has none,
     ``passing`` depend on how the poses were taken. ``checked`` are errors in g
-    of the device's own output; ``state`` says in words what it holds now.
+    of the device's own output; ``correction`` are lines of what its registers leave and
+    gain, of a device with a form of correction; ``state`` says in words what it
+    holds now.
     """
 
     state: str
@@ -569,6 +572,7 @@ class Device:
     host: tuple[str, ...]
     passing: tuple[str, ...]
     rounding_rms_g: float | None
+    correction: tuple[str, ...]
     checked: tuple[tuple[str, float | None], ...]
     checked_verdict: str
     words: tuple[RegisterWord, ...]
@@ -589,6 +593,7 @@ def read_device(papers: Mapping[str, object]) -> Device | None:
         host=tuple(name for name in left if not passes(name)),
         passing=tuple(name for name in left if passes(name)),
         rounding_rms_g=number(known.get("rounding_rms_g")),
+        correction=tuple(text.of_correction(known, number(known.get("rounding_rms_g")))) if "better" in known else (),
         checked=_checked(checked),
         checked_verdict=str(checked.get("verdict") or ""),
         words=tuple(_word(mapping(entry)) for entry in (words if isinstance(words, list) else [])),

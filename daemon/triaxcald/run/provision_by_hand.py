@@ -26,6 +26,7 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.correction import require_unchanged
 from triaxcald.provision.journal import journaled_image, open_journal, parse, registers_of
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import (
@@ -74,6 +75,9 @@ class ProvisionRun:
     serial: str | None = None
     dry_run: bool = False
     force: str | None = None
+    at_start: Mapping[str, bytes] | None = None
+    """Registers by which the device corrected the readings of the calibration, if it
+    did; the device must still hold them."""
     ask: Callable[[Stage, str], None] | None = None
     """Instructs the operator. If given, it asks for a power cycle when no restart
     proves the stored values."""
@@ -135,6 +139,8 @@ class ProvisionRun:
             require_readings_before(bundle.profile, p.found)
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
+        if not p.carried:
+            require_unchanged(p.found.raw, self.at_start)
         self.warnings = p.warnings
         if not p.carried and p.differing and not self.warnings:
             self.warnings = await live_output_warnings(device, bundle, p.found)

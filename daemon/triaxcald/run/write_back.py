@@ -17,6 +17,7 @@ from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, DiskError, Implausible, StationError, TwoAnswer
 from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink
+from triaxcald.provision.correction import require_unchanged
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.registers import (
@@ -104,7 +105,8 @@ class WriteBack:
         await p.examine()
         self.provisioning = p
         require_readings_before(self.place.bundle.profile, p.found)
-        self._require_unchanged(p)
+        if not p.carried:
+            require_unchanged(p.found.raw, self.at_start)
         self.warnings = [*p.warnings, *await asyncio.to_thread(self._output_warnings, acquisition)]
         if self.warnings and self.force is None:
             raise Implausible(text.refused_by_sanity_warnings(self.warnings))
@@ -112,15 +114,6 @@ class WriteBack:
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
         return p
-
-    def _require_unchanged(self, p: Provisioning) -> None:
-        """Raises Refused if somebody has written registers since the readings began."""
-        changed = p.found.differing(self.at_start or {})
-        if changed and not p.carried:
-            raise tc.Refused(
-                f"the register{'s' if len(changed) > 1 else ''} {', '.join(changed)} changed since the readings began, "
-                "which were corrected by them; nothing was written: measure again"
-            )
 
     async def check_alone(self, acquisition: Collection) -> None:
         """Verify the output of a device in which nothing is to be written. Raises

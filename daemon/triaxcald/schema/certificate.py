@@ -75,7 +75,33 @@ class OwnError(tc.schema.Model):
     ]
 
 
-class RegistersOfCertificate(tc.schema.Model):
+class CorrectionOfCertificate(tc.schema.Model):
+    """What the registers of a device's own linear correction leave, and gain."""
+
+    fixed: Annotated[
+        list[str],
+        Field(
+            default_factory=list,
+            description="coefficients of the device's correction without a register; absent without "
+            "`[correction] form`, and so are `left_rms_g`, `left_largest_g`, `own_rms_g` and `better`",
+        ),
+    ]
+    left_rms_g: Annotated[
+        tc.schema.Figure | None, Field(description="rms error of |a| that their lack leaves, over the sphere [g]")
+    ] = None
+    left_largest_g: Annotated[tc.schema.Figure | None, Field(description="largest error that it leaves [g]")] = None
+    own_rms_g: Annotated[OwnError | None, Field(description="rms error of the device's own output over the sphere")] = (
+        None
+    )
+    better: Annotated[
+        bool | None,
+        Field(
+            description="whether the prediction beats the device by more than it may be wrong; else nothing is written"
+        ),
+    ] = None
+
+
+class RegistersOfCertificate(CorrectionOfCertificate):
     terms: Annotated[list[str], Field(description="`linear`, and the effects that the registers correct")]
     left_to_host: Annotated[list[str], Field(description="effects that the device has no registers for")]
     holds: Annotated[
@@ -94,27 +120,6 @@ class RegistersOfCertificate(tc.schema.Model):
         Field(description="[uncertainty](../explanation/uncertainty.md) of the calibration in the registers"),
     ]
     words: Annotated[list[RegisterWord], Field(description="the registers, in the order of the profile")]
-    fixed: Annotated[
-        list[str],
-        Field(
-            default_factory=list,
-            description="coefficients of the device's correction without a register; these five keys are absent "
-            "without `[correction] form`",
-        ),
-    ]
-    left_rms_g: Annotated[
-        tc.schema.Figure | None, Field(description="rms error of |a| that their lack leaves, over the sphere [g]")
-    ] = None
-    left_largest_g: Annotated[tc.schema.Figure | None, Field(description="largest error that it leaves [g]")] = None
-    own_rms_g: Annotated[OwnError | None, Field(description="rms error of the device's own output over the sphere")] = (
-        None
-    )
-    better: Annotated[
-        bool | None,
-        Field(
-            description="whether the prediction beats the device by more than it may be wrong; else nothing is written"
-        ),
-    ] = None
 
 
 class Certificate(tc.schema.Model):

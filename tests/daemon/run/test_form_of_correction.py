@@ -3,6 +3,7 @@ before or after the correction."""
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import random
@@ -262,3 +263,40 @@ def test_a_recording_is_fitted_before_the_correction_of_the_device(line: Callabl
     c = np.diag(SENSED)
     assert fitted.json["scale_factor"] == pytest.approx(c, abs=1e-3)
     assert fitted.json["bias"] == pytest.approx(ZERO, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_fitted_file_is_written_by_hand_while_the_registers_are_those_of_the_recording(
+    line: Callable[..., Line], triaxcal: Run, tmp_path: Path
+) -> None:
+    unit = line("offsets", neutral=False)
+    station = unit.station(provisioning={"write": False})
+    recording = triaxcal("run", station, "--json").json["units"][0]["recording"]
+    file = tmp_path / "fitted.json"
+    assert triaxcal("fit", recording, "-o", file).code == 0
+    held = json.loads(file.read_text())["registers_at_start"]
+    assert set(held) == {"offset_x", "offset_y", "offset_z"}
+
+    # The calibration is of the readings before the correction, and so is `apply`.
+    applied = triaxcal("apply", file, recording, "-o", tmp_path / "applied.csv")
+    assert applied.code == 0, applied.err
+    lines = [line for line in (tmp_path / "applied.csv").read_text().splitlines() if not line.startswith("#")]
+    rows = list(csv.DictReader(lines))
+    a = np.array([[float(row[name]) for name in ("ax", "ay", "az")] for row in rows])
+    assert np.median(np.linalg.norm(a, axis=1)) == pytest.approx(1.0, abs=1e-3)
+
+    dry = triaxcal("provision", file, station, "--dry-run", "--json")
+    assert dry.code == 0, dry.err
+    told = dry.json["correction"]
+    assert told["own_rms_g"]["predicted"] < told["own_rms_g"]["before"]
+    assert told["left_rms_g"] == pytest.approx(unit.linear.best_rms(1.0, 1.0), rel=0.1)
+    assert set(told["fixed"]) == {*MATRIX}
+    assert unit.unit.written == []
+    before = unit.unit._ram["offset_x"]
+    unit.unit._ram["offset_x"] = unit.unit.table["offset_x"].encode(0.01)
+    assert triaxcal("provision", file, station).code == 3
+    assert unit.unit.written == []
+    unit.unit._ram["offset_x"] = before
+    done = triaxcal("provision", file, station)
+    assert done.code == 0, done.err
+    assert unit.own_error_g <= 1.1 * unit.linear.best_rms(1.0, 1.0) + 3 * NOISE
