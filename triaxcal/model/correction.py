@@ -20,6 +20,7 @@ AXES = "xyz"
 ENTRIES = tuple(f"matrix.{row}{column}" for row in AXES for column in AXES)
 OFFSETS = tuple(f"offset.{axis}" for axis in AXES)
 DIAGONAL = ENTRIES[::4]
+"""xx, yy and zz among three rows of three."""
 POWERS: Mapping[str, int] = {"": 0, ".t1": 1, ".t2": 2}
 """Suffixes of the coefficients, by the power of the temperature's deviation [K]."""
 COEFFICIENTS = (
