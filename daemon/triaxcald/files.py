@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -85,6 +86,14 @@ def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
     except OSError as e:
         raise InputError(f"{folder}: cannot be written to: {e.strerror}") from e
     raise AssertionError("there is always another number")
+
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
+
+
+def in_a_name(text: str) -> str:
+    """``text`` as part of a file's name: a device's serial number may be any."""
+    return _UNSAFE.sub("_", text)
 
 
 def unused(path: Path) -> Path:

@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 DRIVERS = ("can", "mcap", "modbus")
 HEAD = """# Register types
 
-These are the values of `type` of a register or, on Modbus, of a channel. Made from the table in `drivers/triaxcal_drivers/registers.py` by `docs/reference/profile.py`. Whole numbers are in two's complement, the others by IEEE 754. Most significant first or last is the profile's order, not the type's. A value goes to the nearest number; one beyond the range is refused.
+These are the values of `type` of a register or, on Modbus, of a channel. Made from the table in `drivers/triaxcal_drivers/registers.py` by `docs/reference/profile.py`. Whole numbers are in two's complement, the others by IEEE 754. Most significant first or last is the profile's order, not the type's. A value goes to the nearest number; one beyond the range is refused. A register may also be of type `ascii`: text of `length` bytes, without NULs and spaces at its ends.
 
 | type | bytes | lowest | highest | step near 1 | on Modbus |
 |---|---|---|---|---|---|

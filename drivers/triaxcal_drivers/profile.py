@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.hints import nearest
-from triaxcal_drivers.registers import RawType
+from triaxcal_drivers.registers import ASCII, RegisterKind
 from triaxcal_drivers.roles import (
     AXES,
     CORRECTION,
@@ -27,6 +27,7 @@ from triaxcal_drivers.roles import (
     OFFSET_ROLES,
     OTHER_ROLES,
     REFERENCE_ROLE,
+    SERIAL_ROLE,
 )
 
 READINGS, CORRECTED = "readings", "corrected"
@@ -34,6 +35,7 @@ READING_CHANNELS = tuple("u" + axis for axis in AXES)
 """A stream has these, and further ones by any names."""
 STREAMS_MOST, CHANNELS_MOST = 16, 256  # ours have two of six channels; a Modbus reply has room for 125
 STEPS_MOST = 100  # of a sequence; ours have at most three
+TEXT_MOST = 250  # bytes: one reply of Modbus
 SCALE_FACTOR_RATIO = 4.0
 """A scale factor this many times off its nominal value is no scale factor of
 the device: data sheets allow 0.1."""
@@ -57,7 +59,8 @@ class Identity(Strict):
     vendor: Annotated[str, Field(description="for people")]
     product: Annotated[str, Field(description="for people")]
     serial_register: Annotated[
-        str | None, Field(description="register that holds the serial number, an integer without scale and offset")
+        str | None,
+        Field(description="register that holds the serial number: text, or an integer without scale and offset"),
     ] = None
     expect: Annotated[
         dict[str, int], Field(description="registers that must hold these raw numbers: product code, vendor…")
@@ -107,11 +110,15 @@ class Register(Strict):
     with a form (``.t1`` per K, ``.t2`` per K²); ``reference_temperature`` [°C],
     ``calibration_date`` (days since 1970-01-01), ``calibration_crc``,
     ``serial_number``, ``write_counter``. The value is ``raw * scale + offset``;
-    it is an exact integer where type, scale and offset are integers.
+    it is an exact integer where type, scale and offset are integers. A register of
+    type "ascii" holds text of ``length`` characters, filled up with NULs or spaces.
     """
 
-    type: Annotated[RawType, Field(description="one of the register types")]
+    type: Annotated[RegisterKind, Field(description="one of the register types")]
     role: Annotated[str | None, Field(description="what it is to a calibration: scale_factor.x, bias.y…")] = None
+    length: Annotated[int | None, Field(ge=1, le=TEXT_MOST, description="bytes of a text, with what fills it up")] = (
+        None
+    )
     access: Annotated[Literal["ro", "rw", "wo"], Field(description="what may be done with it")] = "rw"
     unit: Annotated[str, Field(description="unit of its value")] = ""
     scale: Annotated[int | float, Field(description="value = raw * scale + offset")] = 1.0
@@ -126,7 +133,19 @@ class Register(Strict):
             raise ValueError("scale must not be zero")
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
             raise ValueError(f"minimum {self.minimum} is above maximum {self.maximum}")
+        if (self.type == ASCII) != (self.length is not None):
+            raise ValueError('type = "ascii" and length (in bytes) go together')
+        if self.type == ASCII:
+            self._require_plain_text()
         return self
+
+    def _require_plain_text(self) -> None:
+        if self.access != "ro":
+            raise ValueError('a register of type "ascii" is read-only: set access = "ro"')
+        if self.role not in (None, SERIAL_ROLE):
+            raise ValueError(f'a register of type "ascii" has no role but {SERIAL_ROLE}')
+        if given := {"scale", "offset", "minimum", "maximum"} & self.model_fields_set:
+            raise ValueError(f'{min(given)} is for numbers, not for type "ascii"')
 
 
 class WriteStep(Strict):
@@ -254,6 +273,8 @@ class Profile(Strict):
         for where, name in named:
             if name not in self.registers:
                 raise ValueError(f"{where}: no register named '{name}'{nearest(name, self.registers)}")
+            if self.registers[name].type == ASCII and where != "identity.serial_register":
+                raise ValueError(f'{where}: register {name} holds text (type "ascii"), where a number is needed')
         roles = Counter(r.role for r in self.registers.values() if r.role)
         for role in sorted(r for r, count in roles.items() if count > 1):
             raise ValueError(f"registers: role '{role}' is given twice")
@@ -372,6 +393,11 @@ class Profile(Strict):
         and offset; None where they are no number. Raises RegisterValueError on
         a wrong length."""
         return codec.raw_number(self.registers[name], raw, order=self.wire_order, name=name)
+
+    def text(self, name: str, raw: bytes) -> str:
+        """The text in register ``name`` of type "ascii". Raises
+        RegisterValueError."""
+        return codec.text(self.registers[name], raw, name=name)
 
     def most_significant_first(self, raw: bytes) -> bytes:
         """The bytes of a register, whatever their order on the wire."""

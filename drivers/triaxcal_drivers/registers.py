@@ -133,6 +133,10 @@ TYPES: Mapping[str, RegisterType] = {
 }
 
 
+ASCII = "ascii"
+"""Text, one byte a character: no number, and not in `TYPES`."""
+
+
 def in_words(name: str) -> bool:
     """Whether the type fills registers of 16 bits, as on Modbus."""
     return TYPES[name].size % WORD == 0
@@ -160,11 +164,14 @@ def next_in_words(name: str) -> str | None:
 
 if TYPE_CHECKING:
     RawType = str
+    RegisterKind = str
     WordType = str
     TimeType = str
     CounterType = str
 else:
     RawType = Literal[tuple(TYPES)]
+    """A number that a register of a profile may hold."""
+    RegisterKind = Literal[(*TYPES, ASCII)]
     """What a register of a profile may be."""
     WordType = Literal[tuple(filter(in_words, TYPES))]
     """What a register or channel on Modbus may be."""
@@ -183,6 +190,8 @@ class Format(Protocol):
     @property
     def type(self) -> str: ...
     @property
+    def length(self) -> int | None: ...
+    @property
     def unit(self) -> str: ...
     @property
     def scale(self) -> float: ...
@@ -192,6 +201,26 @@ class Format(Protocol):
     def minimum(self) -> float | None: ...
     @property
     def maximum(self) -> float | None: ...
+
+
+def size_of(register: Format) -> int:
+    """Bytes that the register holds; of a text, the most."""
+    return register.length or 0 if register.type == ASCII else TYPES[register.type].size
+
+
+def text(register: Format, raw: bytes, *, name: str) -> str:
+    """What a register of type "ascii" holds, without the NULs and spaces that fill
+    it up. Raises RegisterValueError on too many bytes, and on others than
+    printable characters."""
+    if len(raw) > size_of(register):
+        raise RegisterValueError(f"register {name}: {len(raw)} bytes, expected {size_of(register)} ({ASCII})")
+    found = raw.decode("ascii", "replace").strip("\0 ")
+    if not (found.isascii() and found.isprintable()):
+        raise RegisterValueError(
+            f"register {name}: {raw.hex()} is no text of printable ASCII characters: check its address, length and "
+            "byte_order"
+        )
+    return found
 
 
 def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> bytes:
@@ -207,6 +236,7 @@ def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> by
                 f"register {name}: {value:g} {register.unit} is outside its limits "
                 f"{register.minimum} to {register.maximum}"
             )
+    _require_number(register, name)
     try:
         data = TYPES[register.type].encode(_unscaled(register, value))
     except (OverflowError, ValueError) as e:
@@ -243,14 +273,20 @@ def raw_number(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> 
 def holds_integers(register: Format) -> bool:
     """Whether every value of the register is an integer. Floats would round
     those from 2^53 on."""
-    return isinstance(TYPES[register.type], Integer) and register.scale % 1 == 0 and register.offset % 1 == 0
+    return isinstance(TYPES.get(register.type), Integer) and register.scale % 1 == 0 and register.offset % 1 == 0
 
 
 def _number(register: Format, raw: bytes, order: ByteOrder, name: str) -> float:
+    _require_number(register, name)
     type_ = TYPES[register.type]
     if len(raw) != type_.size:
         raise RegisterValueError(f"register {name}: {len(raw)} bytes, expected {type_.size} ({register.type})")
     return type_.decode(raw if order == "big" else raw[::-1])
+
+
+def _require_number(register: Format, name: str) -> None:
+    if register.type == ASCII:
+        raise RegisterValueError(f"register {name}: its type is ascii, which is no number")
 
 
 def _unscaled(register: Format, value: float) -> float:

@@ -52,7 +52,7 @@ class Bench(Generic[DoneT]):
     motion: Motion = field(default_factory=Motion)
     before: Coefficients = OLD
     wanted: Coefficients = NEW
-    serial_number: int = SERIAL_NUMBER
+    serial_number: int | str = SERIAL_NUMBER
     serial: str | None = str(SERIAL_NUMBER)
     swapped: tuple[int, Electronics] | None = None
     node: Mapping[str, Any] = field(default_factory=dict)

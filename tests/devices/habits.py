@@ -38,8 +38,10 @@ class Habits:
     """In place of the nine: registers of a correction of another form, by their roles."""
     number: Literal["float32", "int32"] = "float32"
     """Type of the nine registers; as int32 in units of 1e-6."""
-    serial_type: Literal["uint32", "uint64", "int64"] = "uint32"
-    """Type of the serial number."""
+    serial_type: Literal["uint32", "uint64", "int64", "ascii"] = "uint32"
+    """Type of the serial number; "ascii" is text of 12 characters."""
+    byte_order: Literal["big", "little"] = "big"
+    """Modbus: of the two characters in a register of text."""
     word_order: Literal["big", "little"] = "big"
     """Modbus: the order of the words of a value on the wire."""
 

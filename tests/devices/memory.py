@@ -69,7 +69,7 @@ class Electronics:
 
     habits: Habits = field(default_factory=Habits)
     stored: Mapping[str, bytes] | None = None
-    serial_number: int = SERIAL_NUMBER
+    serial_number: int | str = SERIAL_NUMBER
     product_code: int = PRODUCT_CODE
 
     def __post_init__(self) -> None:
@@ -232,8 +232,10 @@ class Electronics:
         if register.startswith("stored_"):
             shown = self._asked if self.habits.read_back == "cached" else {}
             return {**self.eeprom, **shown}[register.removeprefix("stored_")]
+        if isinstance(self.serial_number, str) and register == "serial_number":
+            return entry.encode(self.serial_number)
         facts: dict[str, Callable[[], int]] = {
-            "serial_number": lambda: self.serial_number,
+            "serial_number": lambda: int(self.serial_number),
             "product_code": lambda: self.product_code,
             "write_counter": lambda: self.memory.jobs_done,
             "status": self._status,

@@ -61,13 +61,25 @@ class _Answer:
 
     def _holding(self, address: int, count: int) -> bytes:
         names = self._covered(address, count)
-        return b"".join(self._ordered(self.unit.read(name, self.now)) for name in names)
+        return b"".join(self._shown(name) for name in names)
+
+    def _shown(self, name: str) -> bytes:
+        """Text keeps its registers in order."""
+        raw = self.unit.read(name, self.now)
+        if self.unit.table[name].type != "ascii":
+            return self._swapped(self._ordered(raw))
+        return self._swapped(raw)
+
+    def _swapped(self, raw: bytes) -> bytes:
+        if self.unit.habits.byte_order == "big":
+            return raw
+        return b"".join(raw[i : i + 2][::-1] for i in range(0, len(raw), 2))
 
     def _write(self, address: int, data: bytes) -> float:
         longest = 0.0
         for name in self._covered(address, len(data) // 2):
             size = self.unit.table[name].size
-            longest = max(longest, self.unit.write(name, self._ordered(data[:size]), self.now))
+            longest = max(longest, self.unit.write(name, self._ordered(self._swapped(data[:size])), self.now))
             data = data[size:]
         return longest
 
@@ -88,7 +100,8 @@ class _Answer:
         if self.motion is None or address not in (READINGS, CORRECTED) or count > BLOCK_WORDS:
             raise Refused("unknown")
         triple = self.motion.shown if address == READINGS else self.motion.corrected
-        return b"".join(map(self._ordered, self.motion.encode(triple(self.unit, self.now))))[: 2 * count]
+        shown = b"".join(map(self._ordered, self.motion.encode(triple(self.unit, self.now))))
+        return self._swapped(shown)[: 2 * count]
 
     def _ordered(self, raw: bytes) -> bytes:
         if self.unit.habits.word_order == "big":

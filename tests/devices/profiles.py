@@ -73,7 +73,9 @@ def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, w
     identity["expect"] = {"product_code": wording.product_code}
     parts = [
         _lines({"format": "triaxcal.profile/1", "name": "misbehaving", "driver": driver}),
-        _lines({"word_order": wording.word_order or habits.word_order}) if driver == "modbus" else "",
+        _lines({"word_order": wording.word_order or habits.word_order, "byte_order": habits.byte_order})
+        if driver == "modbus"
+        else "",
         _table("identity", identity),
         _table("output", {"unit": "V", "nominal_scale_factor": [wording.nominal] * 3}),
         _table(
@@ -118,6 +120,8 @@ def _register(driver: Driver, entry: Entry, wording: Wording) -> dict[str, Any]:
     else:
         held = {"address": entry.address}
     held |= {"type": entry.type, "access": entry.access}
+    if entry.type == "ascii":
+        held["length"] = entry.size
     if entry.role:
         held["role"] = entry.role
     if entry.unit:

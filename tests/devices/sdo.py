@@ -107,11 +107,17 @@ class SdoServer:
 
     def _initiate_upload(self, unit: Electronics, frame: bytes, now: float) -> bytes:
         asked = self._object(frame)
-        data = FACTS.get(asked) or unit.read(self._name(unit, asked), now)[::-1]
+        data = FACTS.get(asked) or self._read(unit, asked, now)
         if len(data) <= 4 and not self.segmented:
             return struct.pack("<BHB4s", 0x43 | (4 - len(data)) << 2, *asked, data)
         self._transfer = _Transfer(asked, data, upload=True)
         return struct.pack("<BHBI", 0x41, *asked, len(data))
+
+    def _read(self, unit: Electronics, asked: Object, now: float) -> bytes:
+        """Least significant byte first; a VISIBLE_STRING from its first character on."""
+        name = self._name(unit, asked)
+        data = unit.read(name, now)
+        return data if unit.table[name].type == "ascii" else data[::-1]
 
     def _upload_segment(self, frame: bytes) -> bytes:
         transfer = self._under_way(frame, upload=True)

@@ -21,7 +21,7 @@ INT32_UNIT = 1e-6
 UNITS = {"scale_factor": "V/g", "misalignment": "rad", "bias": "g"}
 LIMITS = {"scale_factor": 10.0, "misalignment": 0.1, "bias": 0.5}
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q",
-            "float32": ">f"}  # fmt: skip
+            "float32": ">f", "ascii": ">12s"}  # fmt: skip
 
 Access = Literal["ro", "rw", "wo"]
 
@@ -47,7 +47,9 @@ class Entry:
     def words(self) -> int:
         return self.size // 2
 
-    def encode(self, value: float) -> bytes:
+    def encode(self, value: float | str) -> bytes:
+        if isinstance(value, str):
+            return value.encode("latin-1").ljust(self.size, b"\0")
         raw = value / self.scale
         return struct.pack(_FORMATS[self.type], raw if self.type == "float32" else round(raw))
 

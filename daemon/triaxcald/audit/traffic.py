@@ -14,7 +14,7 @@ from triaxcald.audit.restart_probes import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
 from triaxcald.provision.access import Label
-from triaxcald.provision.identity import serial_text
+from triaxcald.provision.identity import serial_in
 from triaxcald.provision.registers import RegisterImage, calibration_registers, sanity_warnings
 from triaxcald.provision.restart_check import MISSED, SEQUENCES, may_probe, own_steps, writes_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -188,9 +188,8 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
     found: dict[str, Difference] = {}
     for a in traffic.accesses:
         if a.operation == "read" and not a.error and a.register in meant:
-            number = traffic.profile.raw_number(a.register, a.raw)
-            is_serial = a.register == identity.serial_register
-            answered: object = serial_text(number) if number is not None and is_serial else number
+            of = serial_in if a.register == identity.serial_register else td.Profile.raw_number
+            answered: object = of(traffic.profile, a.register, a.raw)
             if answered != meant[a.register]:
                 found[a.register] = Difference(REGISTERS, Kind.NOT_READ, a.register, meant[a.register], answered)
     return list(found.values())

@@ -23,8 +23,8 @@ class BlankIdentity(WrongUnit):
 
 @dataclass(frozen=True)
 class IdentityRead:
-    """``serial``: the integer in the serial register as text of at least four
-    characters, None where the profile has none.
+    """``serial``: the text in the serial register, or the integer as text of at
+    least four characters; None where the profile has none.
 
     ``values``: the raw numbers of the registers that the profile's identity
     expects, by name.
@@ -52,13 +52,13 @@ async def check_identity(
                 f"register {name} holds {values[name]:#x}, expected {expected:#x}"
             )
     register = profile.identity.serial_register
-    number = await _read_raw_number(device, bundle, register) if register else None
-    serial = None if number is None else serial_text(number)
+    raw = await device.read(register) if register else b""
+    serial = _serial_of(profile, register, raw) if register else None
     if expected_serial is not None and not same_serial(serial, expected_serial):
         if isinstance(device, RegisterLink) and device.tolerant and await _also(device, bundle, expected_serial):
             return IdentityRead(expected_serial, values)
         answers = f"is serial {serial}" if serial else "tells no serial (its profile has no serial_register)"
-        kind = WrongUnit if register is None or number is None else _wrong(profile, register, number)
+        kind = WrongUnit if register is None else _wrong_serial(profile, register, raw)
         raise kind(f"the unit on {where} {answers}, expected {expected_serial}")
     return IdentityRead(serial, values)
 
@@ -78,7 +78,11 @@ async def identified(
     return identity
 
 
-def _wrong(profile: td.Profile, name: str, number: int) -> type[WrongUnit]:
+def _wrong_serial(profile: td.Profile, name: str, raw: bytes) -> type[WrongUnit]:
+    return _wrong(profile, name, profile.raw_number(name, raw)) if _is_number(profile, name) else WrongUnit
+
+
+def _wrong(profile: td.Profile, name: str, number: int | None) -> type[WrongUnit]:
     """Diagnosis of an unexpected number in a register of the identity."""
     ones = 256 ** td.registers.TYPES[profile.registers[name].type].size - 1
     return BlankIdentity if number in (0, -1, ones) else WrongUnit
@@ -87,10 +91,8 @@ def _wrong(profile: td.Profile, name: str, number: int) -> type[WrongUnit]:
 async def _also(link: RegisterLink, bundle: td.Bundle, serial: str) -> bool:
     """Whether the unit of that serial number answers behind another one."""
     name = bundle.profile.identity.serial_register
-    size = 0 if name is None else td.registers.TYPES[bundle.profile.registers[name].type].size
-    late = [e.answer for e in await link.listen(LISTEN_S) if e.register == name and len(e.answer) == size]
-    numbers = [bundle.profile.raw_number(name, raw) for raw in late if name is not None]
-    return any(same_serial(serial_text(n), serial) for n in numbers if n is not None)
+    late = [e.answer for e in await link.listen(LISTEN_S) if e.register == name]
+    return name is not None and any(same_serial(serial_in(bundle.profile, name, raw), serial) for raw in late)
 
 
 ABORT_BYTES = 8
@@ -133,7 +135,7 @@ async def require_alone(link: RegisterLink, bundle: td.Bundle) -> None:
 async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[td.two_senders.ExtraAnswer]]:
     """Value of a register, and the contradicting answers."""
     answers = [await link.read(name)]
-    most = max(td.registers.TYPES[link.profile.registers[name].type].size, ABORT_BYTES)
+    most = max(td.registers.size_of(link.profile.registers[name]), ABORT_BYTES)
     # Another program may ask the unit for something else, and a stream may be
     # polled meanwhile, whose replies are longer than a register.
     extra = await link.listen(LISTEN_S)
@@ -143,27 +145,54 @@ async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[td.
 
 def _who(bundle: td.Bundle, name: str, answers: Sequence[bytes]) -> str:
     """The serial numbers, as far as they are any."""
-    known = bundle.profile.registers[name]
-    size = td.registers.TYPES[known.type].size
-    numbers = [bundle.profile.raw_number(name, raw) for raw in answers if len(raw) == size]
     if name != bundle.profile.identity.serial_register:
         return ", ".join(f"register {name} holds {raw.hex()}" for raw in dict.fromkeys(answers))
-    told = dict.fromkeys(serial_text(n) for n in numbers if n is not None)
+    serials = [serial_in(bundle.profile, name, raw) for raw in answers]
+    told = dict.fromkeys(serial for serial in serials if serial is not None)
     return ", ".join(told) if len(told) > 1 else ", ".join([*told, "and one that answers otherwise"])
 
 
 async def read_serial(device: td.Device, bundle: td.Bundle) -> str | None:
     """The serial number as `IdentityRead` has it. Raises RegisterRefused,
-    DeviceSilent; BlankIdentity where the register holds no number."""
+    DeviceSilent; BlankIdentity where the register holds no number, or no text."""
     name = bundle.profile.identity.serial_register
-    return serial_text(await _read_raw_number(device, bundle, name)) if name else None
+    return _serial_of(bundle.profile, name, await device.read(name)) if name else None
+
+
+def serial_in(profile: td.Profile, name: str, raw: bytes) -> str | None:
+    """The serial number in the bytes of register ``name``; None where they are
+    none."""
+    try:
+        return _serial_of(profile, name, raw)
+    except (BlankIdentity, td.RegisterValueError):
+        return None
+
+
+def _is_number(profile: td.Profile, name: str) -> bool:
+    return str(profile.registers[name].type) != td.registers.ASCII
+
+
+def _serial_of(profile: td.Profile, name: str, raw: bytes) -> str:
+    """Raises BlankIdentity; RegisterValueError on a wrong length of a number."""
+    if _is_number(profile, name):
+        return serial_text(_number_in(profile, name, raw))
+    try:
+        serial = profile.text(name, raw)
+    except td.RegisterValueError as e:
+        raise BlankIdentity(str(e)) from e
+    if not serial:
+        raise BlankIdentity(f"register {name} holds {raw.hex()}, which is no serial number")
+    return serial
 
 
 async def _read_raw_number(device: td.Device, bundle: td.Bundle, name: str) -> int:
-    raw = await device.read(name)
-    number = bundle.profile.raw_number(name, raw)
+    return _number_in(bundle.profile, name, await device.read(name))
+
+
+def _number_in(profile: td.Profile, name: str, raw: bytes) -> int:
+    number = profile.raw_number(name, raw)
     if number is None:
-        kind = bundle.profile.registers[name].type
+        kind = profile.registers[name].type
         raise BlankIdentity(f"register {name} holds {raw.hex()}, which is no {kind} number")
     return number
 

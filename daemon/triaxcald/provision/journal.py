@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import triaxcal_drivers as td
 from triaxcald.documents import json_value
 from triaxcald.errors import DiskError, InputError
-from triaxcald.files import synchronise, write_durably
+from triaxcald.files import in_a_name, synchronise, write_durably
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import check_identity
 from triaxcald.provision.registers import (
@@ -31,7 +31,6 @@ Step = Literal["probing", "writing", "storing", "stored", "unverified"]
 provisioning ended, but no restart has proven the stored values."""
 
 
-_UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 _WHOLE = re.compile(r"(-?)([0-9]+)")
 _RUN = "[0-9a-f]" * 8 + "-*"
 """Prefix pattern of the identifier of a run."""
@@ -91,10 +90,10 @@ class Journal:
         of the same slot."""
         within = folder / FOLDER
         if owner.serial is None:
-            runs = sorted(within.glob(f"{_safe(owner.slot)}-{_RUN}.json"), reverse=True)
+            runs = sorted(within.glob(f"{in_a_name(owner.slot)}-{_RUN}.json"), reverse=True)
             paths = [*runs, within / f"unit-{owner.slot}.json"]
         else:
-            paths = [within / f"{_own_name(owner, '')}.json", within / f"{owner.serial}.json"]
+            paths = [within / f"{_own_name(owner, '')}.json", within / f"{in_a_name(owner.serial)}.json"]
         return [Journal(path) for path in paths if path.exists()]
 
     def read(self) -> Entry | None:
@@ -145,11 +144,7 @@ class Journal:
 
 def _own_name(owner: Owner, run: str) -> str:
     name = f"{owner.slot}-{run}" if owner.serial is None else f"{owner.product}-{owner.serial}"
-    return _safe(name)
-
-
-def _safe(name: str) -> str:
-    return _UNSAFE.sub("_", name)
+    return in_a_name(name)
 
 
 def journals_of(folder: Path, owner: Owner, profile: td.Profile) -> list[tuple[Journal, Entry]]:

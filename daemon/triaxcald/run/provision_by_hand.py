@@ -15,7 +15,7 @@ from triaxcald import text
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.documents import json_value, to_text
 from triaxcald.errors import BAD_INPUT, Implausible, InputError, RecordingError
-from triaxcald.files import write_new
+from triaxcald.files import in_a_name, write_new
 from triaxcald.inputs import document_bytes
 from triaxcald.outcome import (
     SUFFIX,
@@ -218,7 +218,7 @@ class ProvisionRun:
 
     def _write(self, document: tc.interchange.Document) -> Path:
         """Raises InputError."""
-        stem = f"{document['serial'] or self.place.unit.name}-{file_stamp(self.clock_ns())}"
+        stem = f"{in_a_name(document['serial'] or self.place.unit.name)}-{file_stamp(self.clock_ns())}"
         return write_new(self.station.folder, stem, SUFFIX, to_text(document))
 
     def _error(self, ending: Ending) -> str | None:

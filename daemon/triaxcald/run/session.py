@@ -13,6 +13,7 @@ from typing import Any
 import triaxcal_drivers as td
 from triaxcald import text
 from triaxcald.errors import InputError
+from triaxcald.files import in_a_name
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.correction import AT_START, correcting_registers, to_bytes
 from triaxcald.provision.identity import IdentityRead, identified
@@ -144,7 +145,7 @@ class UnitSession:
         return dict((await take_snapshot(link, self.place.bundle, names)).raw)
 
     def recording_name(self, identity: IdentityRead) -> str:
-        return f"{self.name}-{identity.serial or 'unknown'}-{file_stamp(self.clock_ns())}.mcap"
+        return f"{self.name}-{in_a_name(identity.serial or 'unknown')}-{file_stamp(self.clock_ns())}.mcap"
 
     def recording_path(self, identity: IdentityRead) -> Path:
         folder = self.station.folder

@@ -21,7 +21,7 @@ from triaxcald.documents import to_text
 from triaxcald.earlier_calibration import ATTACHMENT as EARLIER
 from triaxcald.earlier_calibration import RECORD, EarlierFile
 from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
-from triaxcald.files import unused, write_new, write_text
+from triaxcald.files import in_a_name, unused, write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
     ATTACHMENT,
@@ -400,7 +400,7 @@ class UnitRun(UnitSession):
         outcome last."""
         if self._recording is None:
             if self._document is not None:  # the attempt came to no recording
-                stem = f"{self.name}-{self._serial or 'unknown'}-{file_stamp(self.clock_ns())}"
+                stem = f"{self.name}-{in_a_name(self._serial or 'unknown')}-{file_stamp(self.clock_ns())}"
                 self._paths[ATTACHMENT] = write_new(self.station.folder, stem, SUFFIX, to_text(self._document))
             return
         artifacts = dict(self._artifacts)

@@ -21,7 +21,7 @@ from triaxcal_drivers.errors import (
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.line import ModbusClient
-from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
+from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream
 from triaxcal_drivers.modbus.protocol import (
     GATEWAY_CODES,
     READ_HOLDING,
@@ -31,7 +31,7 @@ from triaxcal_drivers.modbus.protocol import (
     Misanswered,
     ModbusRefusal,
 )
-from triaxcal_drivers.registers import TYPES
+from triaxcal_drivers.registers import ASCII, size_of
 from triaxcal_drivers.two_senders import ExtraAnswer
 
 _BATCH_REPLIES = 32
@@ -145,7 +145,7 @@ class ModbusDevice:
         for name in [n for n in names if n] + list(self._profile.registers):
             register = self._profile.registers[name]
             if register.access != "wo":
-                return _function(register), register.address, words_of(register.type)
+                return _function(register), register.address, register.words
         stream = self._profile.streams["readings"]
         return stream.function, stream.address, stream.record_start if isinstance(stream, FifoStream) else 1
 
@@ -302,7 +302,7 @@ class ModbusDevice:
 
         def as_register(pdu: bytes) -> bytes:
             """The bytes of the last requested register if this may be its reply."""
-            if entry is None or pdu[0] != _function(entry) or len(pdu) != 2 + 2 * words_of(entry.type):
+            if entry is None or pdu[0] != _function(entry) or len(pdu) != 2 + 2 * entry.words:
                 return pdu
             return self._ordered(entry, pdu[2:])
 
@@ -315,7 +315,7 @@ class ModbusDevice:
         entry = self._register(register)
         self._requested = register
         try:
-            raw = await self._connected().read(_function(entry), entry.address, words_of(entry.type))
+            raw = await self._connected().read(_function(entry), entry.address, entry.words)
         except ModbusRefusal as e:
             raise self._refused(register, "read", e) from e
         except MalformedReply as e:
@@ -326,13 +326,13 @@ class ModbusDevice:
         """Raises RegisterValueError, without sending, if ``raw`` has not the length of
         the register."""
         entry = self._register(register)
-        size = TYPES[entry.type].size
+        size = size_of(entry)
         if len(raw) != size:
             raise RegisterValueError(f"register {register}: {len(raw)} bytes, expected {size} ({entry.type})")
         if entry.table == "input":
             raise RegisterValueError(f"register {register}: an input register cannot be written")
         self._requested = register
-        single = self._profile.single_write and words_of(entry.type) == 1
+        single = self._profile.single_write and entry.words == 1
         try:
             await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
@@ -356,11 +356,12 @@ class ModbusDevice:
         """Converts from the most significant byte first to the device's order. The same
         exchange converts back."""
         words = [raw[i : i + 2] for i in range(0, len(raw), 2)]
-        if (register.word_order or self._profile.word_order) == "little":
+        is_text = register.type == ASCII  # which has characters in order, not words
+        if (register.word_order or self._profile.word_order) == "little" and not is_text:
             words.reverse()
-        if self._profile.byte_order == "little":
+        if (register.byte_order or self._profile.byte_order) == "little":
             words = [w[::-1] for w in words]
-        return b"".join(words)
+        return b"".join(words)[: size_of(register)]
 
     def _connected(self) -> ModbusClient:
         if self._client is None:

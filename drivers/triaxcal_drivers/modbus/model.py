@@ -17,7 +17,17 @@ from triaxcal_drivers.modbus.protocol import (
     TcpAddress,
 )
 from triaxcal_drivers.profile import CHANNELS_MOST, READING_CHANNELS, STREAMS_MOST, Profile, Register, Strict
-from triaxcal_drivers.registers import TYPES, WORD, CounterType, TimeType, WordType, in_words, next_in_words
+from triaxcal_drivers.registers import (
+    ASCII,
+    TYPES,
+    WORD,
+    CounterType,
+    TimeType,
+    WordType,
+    in_words,
+    next_in_words,
+    size_of,
+)
 
 Order = Literal["big", "little"]
 Table = Literal["input", "holding"]
@@ -167,12 +177,21 @@ class ModbusRegister(Register):
     address: Annotated[Address, Field(description="first word, from 0 as on the wire")]
     word_order: Annotated[Order | None, Field(description="where it differs from the profile's")] = None
 
+    byte_order: Annotated[
+        Order | None, Field(description="of bytes in a word, where it differs from the profile's")
+    ] = None
+
+    @property
+    def words(self) -> int:
+        """Registers of 16 bits that it takes."""
+        return -(-size_of(self) // WORD)
+
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if not in_words(self.type):
+        if self.type != ASCII and not in_words(self.type):
             longer = next_in_words(self.type)
             raise ValueError(f"type {self.type} is none of Modbus" + (f": use {longer}" if longer else ""))
-        if self.address + words_of(self.type) > 0x10000:
+        if self.address + self.words > 0x10000:
             raise ValueError(f"address {self.address} leaves no room for {self.type}")
         if self.table == "input" and self.access != "ro":
             raise ValueError('an input register is read-only: set access = "ro"')
@@ -208,7 +227,7 @@ class ModbusProfile(Profile):
             if stream.address + stream.words > 0x10000:
                 raise ValueError(f"streams.{name}: {stream.words} words from {stream.address} leave the table")
         for name, register in self.registers.items():
-            if words_of(register.type) > min(self.max_read_words, self.max_write_words):
+            if register.words > (self.max_read_words if register.access == "ro" else self._most_words):
                 raise ValueError(f"registers.{name}: {register.type} is longer than one request may be")
         self._require_apart()
         sources = [(s.function, s.address) for s in self.streams.values()]
@@ -216,11 +235,15 @@ class ModbusProfile(Profile):
             raise ValueError("streams: two of them start at the same address")
         return self
 
+    @property
+    def _most_words(self) -> int:
+        return min(self.max_read_words, self.max_write_words)
+
     def _require_apart(self) -> None:
         """Words may have several names; two roles in one place are a mistake."""
         placed = sorted((r.table, r.address, name) for name, r in self.registers.items() if r.role)
         for (table, at, one), (other_table, start, other) in itertools.pairwise(placed):
-            words = words_of(self.registers[one].type)
+            words = self.registers[one].words
             if table == other_table and start < at + words:
                 raise ValueError(
                     f"registers.{other}: address {start} lies in {one}, which takes {words} words from {at} on"

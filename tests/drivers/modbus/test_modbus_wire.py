@@ -120,6 +120,26 @@ async def test_bytes_in_a_word_are_swapped_where_the_profile_says_so(bundle, tcp
         await device.close()
 
 
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+@pytest.mark.parametrize("word_order", ["big", "little"])
+async def test_text_keeps_its_registers_in_order_whatever_the_order_of_words(
+    bundle, tcp_device, byte_order, word_order
+):
+    wire = {"big": "5754 3535 3132 3334 3500", "little": "5457 3535 3231 3433 0035"}[byte_order]
+    exchanges = [PROBE, ("0002 0000 0006 11 03 007F 0005", f"0002 0000 000D 11 03 0A {wire}")]
+    text = f'sn = {{ address = 0x7F, type = "ascii", length = 9, byte_order = "{byte_order}", access = "ro" }}\n'
+    made = bundle(
+        ('name = "by-hand"', f'name = "by-hand"\nword_order = "{word_order}"'),
+        ("[registers]\n", "[registers]\n" + text),
+    )
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(made, heard)
+        raw = await device.read("sn")
+        await device.close()
+    assert raw == b"WT5512345"
+    assert made.profile.text("sn", raw) == "WT5512345"
+
+
 async def test_a_refused_register_names_itself_and_the_code(bundle, tcp_device):
     exchanges = [
         PROBE,
