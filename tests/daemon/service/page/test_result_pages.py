@@ -287,7 +287,8 @@ def test_an_operator_signs_in_works_and_signs_out(guarded: Stage, browser: Brows
     expect(page.locator(".card.scanned")).to_have_count(1)
     page.locator("details.settings summary").click()
     expect(page.locator(".menu")).to_contain_text("olena, operator")
-    page.get_by_role("button", name="Sign out").click()
+    with page.expect_navigation():
+        page.get_by_role("button", name="Sign out").click()
     page.locator("details.settings summary").click()
     expect(page.locator(".menu").get_by_role("link", name="Sign in")).to_be_visible()
     page.context.close()
