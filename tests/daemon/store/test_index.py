@@ -494,20 +494,39 @@ for _ in range(5):
 # Cost.
 
 
-@pytest.mark.slow
-def test_twenty_thousand_outcomes_take_less_than_ten_seconds_and_300_mib(tmp_path: Path) -> None:
-    fill(tmp_path, 20_000)
-    command = [sys.executable, "-m", "triaxcald.cli", "results", str(tmp_path)]
+PEER = """
+import hashlib, json, sys
+from pathlib import Path
+for path in sorted(Path(sys.argv[1]).glob("*.outcome.json")):
+    read = path.read_bytes()
+    hashlib.sha256(read).digest()
+    json.loads(read)
+"""
+"""Reads each outcome once and keeps nothing: the least that a first reading costs."""
+
+
+def cost(*command: object) -> tuple[float, float]:
+    """Processor time [s] and largest memory [MiB] of a process."""
     code = (
         "import resource, subprocess, sys\n"
         "subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)\n"
         "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
         "print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)\n"
     )
-    for most_s in (10.0, 5.0):  # from nothing, and again
-        done = subprocess.run([sys.executable, "-c", code, *command], check=True, capture_output=True, text=True)
-        processor_s, mib = map(float, done.stdout.split())
-        assert processor_s < most_s
+    done = subprocess.run([sys.executable, "-c", code, *map(str, command)], check=True, capture_output=True, text=True)
+    processor_s, mib = map(float, done.stdout.split())
+    return processor_s, mib
+
+
+@pytest.mark.slow
+def test_the_index_of_twenty_thousand_outcomes_is_cheap(tmp_path: Path) -> None:
+    """Costs are multiples of the peer's in the same test, which hold on a slow machine; `benchmarks.results_index` has
+    seconds."""
+    fill(tmp_path, 20_000)
+    peer_s, _ = cost(sys.executable, "-c", PEER, tmp_path)
+    for most in (8.0, 1.6):  # measured: 4.7 from nothing, 0.8 again
+        processor_s, mib = cost(sys.executable, "-m", "triaxcald.cli", "results", tmp_path)
+        assert processor_s < most * peer_s
         assert mib < 300
     gc.collect()
     gc.freeze()  # what other tests left in this process
@@ -515,4 +534,4 @@ def test_twenty_thousand_outcomes_take_less_than_ten_seconds_and_300_mib(tmp_pat
     assert History.of(tmp_path, "unknown").latest is None
     gc.unfreeze()
     ended = resource.getrusage(resource.RUSAGE_SELF)
-    assert ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime < 1.0
+    assert ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime < 0.5 * peer_s
