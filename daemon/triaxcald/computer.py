@@ -16,10 +16,15 @@ import numpy.linalg
 import scipy.linalg  # brings a library of linear algebra of its own
 from threadpoolctl import ThreadpoolController
 
+from triaxcald.memory import require_room_for_buffers
+
 PROCESSOR, BLAS, KERNEL = "processor", "blas", "blas_kernel"
 KEYS = (PROCESSOR, BLAS, KERNEL)
 """Beside the versions of software, where it is said what computed a result."""
 _CPUINFO = Path("/proc/cpuinfo")
+_TAKES_A_BUFFER = 128
+"""Rows of a product that no library computes without its buffer; OpenBLAS has
+other code for small ones, of up to 100 rows."""
 
 
 def compute_with_one_thread() -> None:
@@ -31,9 +36,13 @@ def compute_with_one_thread() -> None:
 
 @cache
 def _take_buffers() -> None:
-    """Each library takes its own at its first use."""
-    for inverse in (numpy.linalg.inv, scipy.linalg.inv):
-        inverse(numpy.eye(2))
+    """Each library takes its own at its first product: an inverse may do without,
+    because scipy finds that a matrix is diagonal. Raises MemoryError where the
+    limit of the address space leaves no room for them."""
+    require_room_for_buffers()
+    square = numpy.ones((_TAKES_A_BUFFER, _TAKES_A_BUFFER))
+    numpy.dot(square, square.T.copy())
+    scipy.linalg.blas.dgemm(1.0, square, square)
 
 
 @cache

@@ -14,9 +14,12 @@ from contextlib import contextmanager
 _LIBRARY_SAYS = ("failed to map segment", "cannot allocate memory", "unable to allocate")
 """What the loader of shared libraries says in an ImportError (glibc, musl)."""
 _THREAD_SAYS = "can't start new thread"  # its stack could not be had
-_LIBRARIES_BYTES, _THREAD_BYTES = 224 * 2**20, 48 * 2**20
-"""Address space that numpy, scipy and what else a command loads take, and each
+_LIBRARIES_BYTES, _THREAD_BYTES = 298 * 2**20, 48 * 2**20
+"""Address space that numpy, scipy and what else `fit` loads take (versions 2.4 and
+1.17, on Linux: 346 MiB with one thread, measured after the imports), and each
 thread of linear algebra with its buffer and stack, of numpy and of scipy."""
+_BUFFERS_BYTES = 2 * 33 * 2**20
+"""OpenBLAS's buffers, of numpy and of scipy: 32 MiB each and their alignment."""
 _DEPTH = 20  # of errors that others caused
 _ROOM_BYTES = 32 * 2**20
 """A library that is loaded with less address space left may fail with any error:
@@ -63,6 +66,15 @@ def require_address_space() -> None:
         raise MemoryError(
             f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for the {wanted >> 20} MiB"
             " of the libraries"
+        )
+
+
+def require_room_for_buffers() -> None:
+    """Where a limit (``ulimit -v``) is set, before the first product of matrices.
+    Raises MemoryError."""
+    if (limit := _limit_in_the_way(_BUFFERS_BYTES)) is not None:
+        raise MemoryError(
+            f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for linear algebra"
         )
 
 
