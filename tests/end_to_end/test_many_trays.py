@@ -289,7 +289,10 @@ class Factory:
         return slots
 
     def _unit(self, slot: Slot, station: str) -> ReferenceUnit:
-        fixture = {**FIXTURE, "hold_s": 0.3} if slot.fault == "never still" else FIXTURE
+        fixture = {
+            "never still": {**FIXTURE, "hold_s": 0.3},
+            "dead axis": {**FIXTURE, "poses": 2 * POSES},  # the other axes cannot tell some poses apart
+        }.get(slot.fault, FIXTURE)
         device = self.workshop.device(serial=slot.holds, seed=int(self._rng.integers(2**31)), fixture=fixture)
         sound = line.described(device)
         physics = sound.physics
