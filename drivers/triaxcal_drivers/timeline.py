@@ -129,8 +129,11 @@ class Timeline:
         if a.counter is None and a.stamp is not None:
             ticks = signed_steps(a.stamp, last_stamp, self._clock.stamp_bits or 64)
             at_start = a.broken & (a.stamp * self._clock.tick_ns < near)
-            too_far = ticks * self._clock.tick_ns < -self._clock.repeat_window * self._clock.period_ns
-            return ticks, ticks.copy(), (ticks < 0) & (at_start | too_far)
+            passed_ns = ticks * self._clock.tick_ns
+            too_far = passed_ns < -self._clock.repeat_window * self._clock.period_ns
+            # A stamp near its wrap that begins anew looks as if it had gone on.
+            too_fast = passed_ns > FASTEST * np.maximum(elapsed_ns, 0) + near
+            return ticks, ticks.copy(), (ticks < 0) & (at_start | too_far) | too_fast
         assert a.counter is not None
         modulus = 1 << (self._clock.counter_bits or 16)
         steps = np.diff(a.counter, prepend=last_counter) % modulus
@@ -145,7 +148,8 @@ class Timeline:
         steps = steps + (np.rint((by_stamp - steps) / modulus) * modulus).astype(np.int64)
         contradicts = np.abs(by_stamp - steps) > 2 + 0.05 * np.abs(by_stamp)
         at_start = (steps < 0) & a.broken & (a.stamp * self._clock.tick_ns < near)
-        return steps, ticks, contradicts | at_start | (steps < -self._clock.repeat_window)
+        too_fast = ticks * self._clock.tick_ns > FASTEST * np.maximum(elapsed_ns, 0) + near
+        return steps, ticks, contradicts | at_start | too_fast | (steps < -self._clock.repeat_window)
 
     def _begin(self, arrival_ns: int, elapsed_ns: int) -> None:
         """A new epoch: the first, or after a restart."""

@@ -61,9 +61,8 @@ def test_time_stamps_are_unwrapped_and_beat_the_nominal_rate():
 
 def test_a_gap_of_more_than_a_counter_turn_is_known_from_the_time_stamp():
     gap = 2**16 + 100
-    placed = Timeline(STAMPED).place(
-        arrivals(counter=[10, 11, 11 + gap], stamp_us=np.array([10, 11, 11 + gap]) * 10_000)
-    )
+    counts = np.array([10, 11, 11 + gap])
+    placed = Timeline(STAMPED).place(arrivals(counter=counts, stamp_us=counts * 10_000, arrival_ns=counts * 10_000_000))
     assert placed.missing == gap - 1
     assert placed.counter.tolist() == [10, 11, 11 + gap]
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.can.adapter import Identifier
-from triaxcal_drivers.can.layout import NODES, Layout, stream_layout
+from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
 from triaxcal_drivers.can.model import CanBus, CanProfile
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import EXTENDED_KEY, LineLoad, RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import READING_CHANNELS, Bundle
-from triaxcal_drivers.timeline import signed_steps
+from triaxcal_drivers.timeline import Arrivals, Clockwork, Timeline, signed_steps
 from triaxcal_drivers.two_senders import Senders, by_arrival, by_counter
 
 if TYPE_CHECKING:
@@ -67,6 +67,48 @@ class TogetherInTime:
         return bool(self._had)
 
 
+class TogetherFromBegin:
+    """A sample begins with message ``begins`` and takes each other one once before
+    the next begin, within one period. ``messages`` is how many a whole sample
+    has. Messages whose begin was lost are a sample of their own, which is never
+    whole; those before the first begin belong to none."""
+
+    def __init__(self, messages: int, begins: int, period_ns: float) -> None:
+        self._messages, self._begins, self._period_ns = messages, begins, period_ns
+        self._had: set[int] = set()
+        self._start_ns = 0
+        self._headless = False
+        self._begun = False
+
+    def samples_of(self, time_ns: Ints, message: Ints) -> Ints:
+        """The sample of each record, as of `TogetherInTime`; -1 for none."""
+        sample = np.full(len(time_ns), -1, dtype=np.int64)
+        number = 0 if self._had else -1
+        for i, (at_ns, which) in enumerate(zip(time_ns.tolist(), message.tolist(), strict=True)):
+            if which == self._begins:
+                number, self._begun = number + 1, True
+                self._had, self._start_ns, self._headless = {which}, at_ns, False
+            elif not self._begun:
+                continue
+            elif not self._had or which in self._had or abs(at_ns - self._start_ns) > self._period_ns:
+                number += 1
+                self._had, self._start_ns, self._headless = {which}, at_ns, True
+            else:
+                self._had.add(which)
+            sample[i] = number
+            if len(self._had) == self._messages:
+                self._had = set()
+        return sample
+
+    @property
+    def open(self) -> bool:
+        """Whether the last sample still lacks messages."""
+        return bool(self._had)
+
+
+_EXACT = (1 << 52) - 1
+"""What a float holds of a whole number, of which a longer time stamp keeps so many
+bits: it wraps earlier."""
 LATEST = 8
 """A message may come this many samples late; an unfinished sample is waited for
 so long."""
@@ -81,18 +123,25 @@ device's rate is off by a tenth."""
 class _Parts:
     """Records that belong to the stream: host time, message number, counter,
     the values they hold (those of the channels, then for each signal that says
-    whether the sample is valid, 1 where it is), and whether records were lost
-    since the one before."""
+    whether the sample is valid, 1 where it is, then the counter and time stamp that
+    one message bears), whether records were lost since the one before, and their
+    place among all records of the stream."""
 
     time_ns: Ints
     message: Ints
     counter: Ints
     values: NDArray[np.float64]  # (columns, n), nan where the message does not hold the column
     after_gap: NDArray[np.bool_]
+    order: Ints
 
     def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
         return _Parts(
-            self.time_ns[rows], self.message[rows], self.counter[rows], self.values[:, rows], self.after_gap[rows]
+            self.time_ns[rows],
+            self.message[rows],
+            self.counter[rows],
+            self.values[:, rows],
+            self.after_gap[rows],
+            self.order[rows],
         )
 
     def __len__(self) -> int:
@@ -105,7 +154,63 @@ class _Parts:
             np.concatenate([self.counter, other.counter]),
             np.concatenate([self.values, other.values], axis=1),
             np.concatenate([self.after_gap, other.after_gap]),
+            np.concatenate([self.order, other.order]),
         )
+
+
+@dataclass(frozen=True)
+class _Firsts:
+    """Of each sample the part that came first: its host time, and its place among
+    all records; and whether records were lost before one of its parts."""
+
+    time_ns: Ints
+    order: Ints
+    after_gap: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, parts: _Parts, row: Ints, rows: int) -> _Firsts:
+        """``row`` is the sample of each part, of ``rows``."""
+        time_ns = np.full(rows, np.iinfo(np.int64).max)
+        order, after_gap = time_ns.copy(), np.zeros(rows, dtype=bool)
+        np.minimum.at(time_ns, row, parts.time_ns)
+        np.minimum.at(order, row, parts.order)
+        np.logical_or.at(after_gap, row, parts.after_gap)
+        return cls(time_ns, order, after_gap)
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Firsts:
+        return _Firsts(self.time_ns[rows], self.order[rows], self.after_gap[rows])
+
+
+class _Beside:
+    """The values of messages outside the samples, as far as samples still need
+    them."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._first = layout.sample  # number of the first such message
+        self._of: dict[int, _Parts] = {}
+
+    def add(self, parts: _Parts) -> None:
+        for number in np.unique(parts.message).tolist():
+            mine = parts[parts.message == number]
+            self._of[number] = self._of[number].followed_by(mine) if number in self._of else mine
+
+    def newest(self, number: int, column: int, firsts: _Firsts, latest_s: float) -> NDArray[np.float64]:
+        """The newest value of a message before each sample; nan where there is none, or
+        it is older than ``latest_s``."""
+        values = np.full(len(firsts.order), np.nan)
+        if (held := self._of.get(number)) is None:
+            return values
+        at = np.searchsorted(held.order, firsts.order) - 1
+        fresh = (at >= 0) & (firsts.time_ns - held.time_ns[at] <= latest_s * 1e9)
+        values[fresh] = held.values[column, at[fresh]]
+        return values
+
+    def forget(self, order: int) -> None:
+        """What no sample needs that begins with record ``order`` or later."""
+        for number, held in self._of.items():
+            at = int(np.searchsorted(held.order, order)) - 1
+            if at > 0:
+                self._of[number] = held[np.arange(at, len(held))]
 
 
 class CanDecoder:
@@ -129,10 +234,18 @@ class CanDecoder:
     **Time.** Host time of the first record, plus the periods counted since;
     host time where there is no counter.
 
-    **Together by time.** Without a counter, messages that come within half a
-    period of a sample's first one are that sample, each once; its time is that
-    of the first. One that lacks messages when the next begins is given up, and
-    counted ``incomplete``.
+    **Together.** Without a counter in every message they are joined by
+    `TogetherInTime` or `TogetherFromBegin`. A sample's time is that of its first
+    message, or that of a counter or time stamp that one of its messages bears
+    (`Timeline`). A sample that lacks messages when the next begins is given up,
+    and counted ``incomplete``.
+
+    **Multiplexed.** Of a message whose signals are multiplexed, the frames with
+    another selector are passed over.
+
+    **Beside.** Some channels come in messages outside the sample. The newest value
+    before the sample's first message counts; a sample with none, or an old one,
+    is left out, and counted ``incomplete``.
 
     **Samples.** One is delivered when every message of it has come and the ones
     before it are settled. One that lacks messages is given up, and counted
@@ -146,7 +259,9 @@ class CanDecoder:
         self._layout = layout
         self._period_ns = 1e9 / rate_hz
         self._names = tuple(layout.channels)
-        self._columns = (*layout.channels.values(), *layout.valid.items())  # message and signal of each
+        single = [entry[:2] for entry in (layout.count, layout.stamp) if entry is not None]
+        valid = [entry[:2] for entry in layout.valid]
+        self._columns = (*layout.channels.values(), *valid, *single)  # message and signal of each
         self._sizes = [layout.size(i) for i in range(len(layout.messages))]
         self._range = 1 << layout.counter_bits
         self._latest = min(LATEST, self._range // 8)
@@ -160,23 +275,37 @@ class CanDecoder:
         self._settled = 0  # every sample below is delivered or given up
         empty = np.zeros(0, dtype=np.int64)
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
-        self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool))
-        self._together = TogetherInTime(len(layout.messages), self._period_ns)
+        self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool), empty)
+        self._together: TogetherInTime | TogetherFromBegin = (
+            TogetherInTime(layout.sample, self._period_ns)
+            if layout.begins is None
+            else TogetherFromBegin(layout.sample, layout.begins, self._period_ns)
+        )
+        self._beside = _Beside(layout) if layout.latest_s else None
+        self._timeline = _timeline(layout, self._period_ns)
+        self._placed_ns = 0  # host time of the last sample that it placed
+        self._order = 0  # records of the stream so far
         self._senders = self._watched()
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         parts, errors, malformed = self._extract(batch)
+        if self._beside is not None:
+            outside = parts.message >= self._layout.sample
+            self._beside.add(parts[outside])
+            parts = parts[~outside]
         if not len(parts):
-            block = self._block(parts.time_ns, parts.counter, parts.values)
+            block = self._block(parts.time_ns, parts.counter, parts.values, _Firsts.of(parts, parts.message, 0))
             return replace(block, errors=errors, malformed=malformed)
         if not self._started:
             self._start(parts)
         if self._layout.counters:
             block = self._assemble(parts)
-        elif len(self._layout.messages) > 1:
-            block = self._by_time(parts)
+        elif self._layout.sample > 1:
+            block = self._joined(parts)
         else:
             block = self._as_they_come(parts)
+        if self._beside is not None:
+            self._beside.forget(int(self._held.order.min(initial=self._order)))
         return replace(block, errors=errors, malformed=malformed, two_senders=self._two_senders(parts, block))
 
     def _two_senders(self, parts: _Parts, block: SampleBlock) -> bool:
@@ -193,9 +322,9 @@ class CanDecoder:
 
     def _watched(self) -> Senders:
         if self._layout.counters:
-            return Senders(self._range, by_counter, len(self._layout.messages))
+            return Senders(self._range, by_counter, self._layout.sample)
         by_moment = partial(by_arrival, period_ns=self._period_ns)
-        return Senders(self._range, by_moment, len(self._layout.messages))
+        return Senders(self._range, by_moment, self._layout.sample)
 
     def _start(self, parts: _Parts) -> None:
         self._started = True
@@ -225,12 +354,18 @@ class CanDecoder:
                     continue
                 if column < len(self._names):
                     values[column, mine] = signal.values(data)
+                elif column < len(self._names) + len(self._layout.valid):
+                    allowed = self._layout.valid[column - len(self._names)][2]
+                    values[column, mine] = np.isin(signal.raw(data).astype(np.int64), allowed)
                 else:
-                    values[column, mine] = np.isin(signal.raw(data).astype(np.int64), self._layout.valid_values)
+                    values[column, mine] = signal.raw(data).astype(np.int64) & _EXACT
             if self._layout.counters:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
         after_gap = self._after_gap(batch, rows)
-        return _Parts(batch.time_ns[rows], message, counter, values, after_gap), int(bad.sum()), int(short.sum())
+        order = self._order + np.arange(len(rows))
+        self._order += len(rows)
+        parts = _Parts(batch.time_ns[rows], message, counter, values, after_gap, order)
+        return parts, int(bad.sum()), int(short.sum())
 
     def _after_gap(self, batch: RawBatch, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether a gap precedes each of the records ``rows``, also if a record of
@@ -249,6 +384,8 @@ class CanDecoder:
         for number, message in enumerate(self._layout.messages):
             above = key - message.identifier - message.extended * EXTENDED_KEY
             match = (above >= 1) & (above <= NODES) if message.per_node else above == 0
+            if message.selected:
+                match &= _selected(message, batch, match & usable)
             found[match & usable] = number
             node[match] = above[match]
         shifting = found >= 0
@@ -264,32 +401,32 @@ class CanDecoder:
         counter = self._settled + np.arange(len(parts))
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
-        return self._block(time_ns, counter, parts.values)
+        return self._block(time_ns, counter, parts.values, _Firsts(parts.time_ns, parts.order, parts.after_gap))
 
-    def _by_time(self, parts: _Parts) -> SampleBlock:
+    def _joined(self, parts: _Parts) -> SampleBlock:
         """Join parts to samples; parts of an incomplete sample are kept for the next
         batch."""
-        sample = np.concatenate(
-            [np.zeros(len(self._held), dtype=np.int64), self._together.samples_of(parts.time_ns, parts.message)]
-        )
-        parts = self._held.followed_by(parts)
-        last = int(sample[-1])
+        joined = self._together.samples_of(parts.time_ns, parts.message)
+        sample = np.concatenate([np.zeros(len(self._held), dtype=np.int64), joined[joined >= 0]])
+        parts = self._held.followed_by(parts[joined >= 0])
+        last = int(sample[-1]) if len(sample) else -1
         settled = last if self._together.open else last + 1
         self._held = parts[sample >= settled]
-        complete = np.bincount(sample)[:settled] == len(self._layout.messages)
+        complete = np.bincount(sample, minlength=settled)[:settled] == self._layout.sample
         values = self._rows(parts, sample, last + 1)[:, :settled][:, complete]
         first = parts.time_ns[np.searchsorted(sample, np.arange(settled))]
         time_ns = np.maximum.accumulate(np.concatenate([[self._last_ns], first]))[1:]
         counter = self._settled + np.arange(settled)
         self._settled += settled
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
-        block = self._block(time_ns[complete], counter[complete], values)
-        return replace(block, incomplete=settled - int(complete.sum()))
+        firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)[complete]
+        block = self._block(time_ns[complete], counter[complete], values, firsts)
+        return replace(block, incomplete=block.incomplete + settled - int(complete.sum()))
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
         """The values (columns, rows) of parts that belong to samples ``row``."""
         values = np.full((len(self._columns), rows), np.nan)
-        for number in range(len(self._layout.messages)):
+        for number in range(self._layout.sample):
             mine = np.flatnonzero(parts.message == number)
             to = row[mine]
             for column, (at, _) in enumerate(self._columns):
@@ -339,12 +476,12 @@ class CanDecoder:
         return replace(block, duplicates=duplicates, restarts=self._restarts)
 
     def _key(self, parts: _Parts) -> Ints:
-        return parts.counter * len(self._layout.messages) + parts.message
+        return parts.counter * self._layout.sample + parts.message
 
     def _settle(self, parts: _Parts) -> SampleBlock:
         """Deliver and give up what can be, hold the rest."""
         samples, row, came = _samples_of(parts.counter)
-        complete = came == len(self._layout.messages)
+        complete = came == self._layout.sample
         given_up = max(self._settled, self._top - self._latest)
         ahead = np.searchsorted(samples, given_up)
         whole = complete[ahead:] & (samples[ahead:] == given_up + np.arange(len(samples) - ahead))
@@ -353,23 +490,89 @@ class CanDecoder:
         values = self._rows(parts, row, len(samples))
         counter = samples[new & complete]
         time_ns = self._origin_ns + np.rint((counter - self._origin) * self._period_ns).astype(np.int64)
+        firsts = _Firsts.of(parts, row, len(samples))[new & complete]
+        block = self._block(time_ns, counter, values[:, new & complete], firsts)
         block = replace(
-            self._block(time_ns, counter, values[:, new & complete]),
+            block,
             missing=settled - self._settled - int(new.sum()),
-            incomplete=int((new & ~complete).sum()),
+            incomplete=block.incomplete + int((new & ~complete).sum()),
         )
         self._settled = settled
         self._held = parts[parts.counter >= self._top - self._latest]
         return block
 
-    def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64]) -> SampleBlock:
-        valid = (values[len(self._names) :] == 1).all(axis=0)
-        if not valid.all():
-            time_ns, counter, values = time_ns[valid], counter[valid], values[:, valid]
+    def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64], firsts: _Firsts) -> SampleBlock:
+        """Whole samples, with the counts of those that are left out."""
+        placed = None
+        if self._timeline is not None:
+            placed = self._timeline.place(self._arrivals(values, firsts))
+            time_ns, values, firsts = placed.time_ns, values[:, placed.new], firsts[placed.new]
+            counter = placed.counter if self._layout.count or not self._layout.counters else counter[placed.new]
+        fresh = np.ones(len(time_ns), dtype=bool)
+        for name, latest_s in self._layout.latest_s.items():
+            assert self._beside is not None
+            column, number = self._names.index(name), self._layout.channels[name][0]
+            values[column] = self._beside.newest(number, column, firsts, latest_s)
+            fresh &= ~np.isnan(values[column])
+        valid = (values[len(self._names) : len(self._names) + len(self._layout.valid)] == 1).all(axis=0)
+        stale, invalid = int((~fresh).sum()), int((fresh & ~valid).sum())
+        if stale or invalid:
+            kept = fresh & valid
+            time_ns, counter, values = time_ns[kept], counter[kept], values[:, kept]
         columns = [self._names.index(name) for name in READING_CHANNELS]
         auxiliary = {n: values[i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
         readings = np.ascontiguousarray(values[columns].T)
-        return SampleBlock(time_ns, counter, readings, auxiliary, invalid=len(valid) - int(valid.sum()))
+        block = SampleBlock(time_ns, counter, readings, auxiliary, invalid=invalid, incomplete=stale)
+        if placed is not None:
+            repeated = len(placed.new) - int(placed.new.sum())
+            block = replace(block, missing=placed.missing, restarts=placed.restarts, duplicates=repeated)
+        return block
+
+    def _arrivals(self, values: NDArray[np.float64], firsts: _Firsts) -> Arrivals:
+        """What `Timeline` places samples by."""
+        count, stamp = self._layout.count, self._layout.stamp
+        at = len(self._names) + len(self._layout.valid)
+        counts = values[at].astype(np.int64) if count else None
+        stamps = values[at + (count is not None)].astype(np.int64) if stamp else None
+        elapsed = np.diff(firsts.time_ns, prepend=self._placed_ns or firsts.time_ns[:1].sum())
+        if len(firsts.time_ns):
+            self._placed_ns = int(firsts.time_ns[-1])
+        return Arrivals(
+            counts,
+            stamps,
+            np.zeros(len(firsts.time_ns), np.int64),
+            firsts.time_ns,
+            firsts.after_gap | (elapsed > LATEST * self._period_ns),
+            # A time stamp bridges a gap by itself; a counter may wrap within.
+            np.zeros(len(firsts.time_ns), dtype=bool) if stamp else firsts.after_gap,
+        )
+
+
+def _timeline(layout: Layout, period_ns: float) -> Timeline | None:
+    """What places samples by the counter or time stamp that one message bears."""
+    if layout.count is None and layout.stamp is None:
+        return None
+    return Timeline(
+        Clockwork(
+            period_ns,
+            layout.count[1].length if layout.count else None,
+            min(layout.stamp[1].length, _EXACT.bit_length()) if layout.stamp else None,
+            layout.stamp[2] * 1e9 if layout.stamp else 1.0,
+        )
+    )
+
+
+def _selected(message: Message, batch: RawBatch, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the candidates are the message's frames by their selectors. One too
+    short for its selector counts too: it is malformed."""
+    size = max(selection.selector.size for selection in message.selected)
+    rows = np.flatnonzero(candidates & (batch.length >= size))
+    length = batch.length.astype(np.int64)
+    starts = (np.cumsum(length) - length)[rows]
+    data = np.frombuffer(batch.payload, dtype=np.uint8)[starts[:, None] + np.arange(size)]
+    found = candidates & (batch.length < size)
+    found[rows] = np.logical_and.reduce([selection.holds(data) for selection in message.selected])
+    return found
 
 
 def _samples_of(counter: Ints) -> tuple[Ints, Ints, Ints]:
@@ -416,7 +619,7 @@ class CanDriver:
         for name in bundle.profile.streams:
             layout = _layout(bundle, name)
             bits = []
-            for number, message in enumerate(layout.messages):
+            for number, message in enumerate(layout.messages[: layout.sample]):
                 key = message.identifier_of(bus.node_id), message.extended
                 if key not in counted:
                     bits.append(8 * layout.size(number) + (EXTENDED_BITS if message.extended else STANDARD_BITS))

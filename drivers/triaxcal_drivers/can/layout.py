@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 NODES = 127
 SHORTEST_COUNTER = 4
+SHORTEST_STAMP = 8  # bits; a shorter one wraps within a few samples
 FRAME_MOST = 64  # bytes of a CAN FD frame
 STANDARD_MOST = 0x7FF  # the highest identifier of 11 bits
 _IDENTIFIER = re.compile("0[xX]([0-9A-Fa-f]{1,8})([xX]?)")
@@ -46,7 +47,8 @@ class Signal:
 
     Bit k is bit k % 8 (0 the least significant) of byte k // 8. ``start`` is
     the signal's least significant bit where it is little-endian, its most
-    significant one where it is big-endian.
+    significant one where it is big-endian. ``selected`` says which frames of
+    the message hold it; all of them where it is empty.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Signal:
     is_float: bool = False
     scale: float = 1.0
     offset: float = 0.0
+    selected: tuple[Selection, ...] = ()
 
     def _place(self) -> tuple[range, int]:
         """The bytes it touches, least significant first, and how far it lies
@@ -98,10 +101,47 @@ class Signal:
 
 
 @dataclass(frozen=True)
+class Selection:
+    """Frames whose ``selector``, unscaled, is in one of the ``ranges`` (first,
+    last)."""
+
+    selector: Signal
+    ranges: tuple[tuple[int, int], ...]
+
+    def holds(self, data: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of the frames ``data`` (n, bytes) are selected."""
+        found = self.selector.raw(data).astype(np.int64)
+        held = np.zeros(len(data), dtype=bool)
+        for first, last in self.ranges:
+            held |= (first <= found) & (found <= last)
+        return held
+
+    def within(self, other: Selection) -> bool:
+        """Whether ``other`` selects every frame that this one selects."""
+        return self.selector.name == other.selector.name and all(
+            any(low <= first and last <= high for low, high in other.ranges) for first, last in self.ranges
+        )
+
+    def apart_from(self, other: Selection) -> bool:
+        return self.selector.name == other.selector.name and all(
+            last < low or high < first for first, last in self.ranges for low, high in other.ranges
+        )
+
+    def __str__(self) -> str:
+        ranges = (str(first) if first == last else f"{first}-{last}" for first, last in self.ranges)
+        return f"{self.selector.name} = {', '.join(ranges)}"
+
+
+def _implied(signal: Signal, selected: Sequence[Selection]) -> bool:
+    """Whether frames that are so ``selected`` hold the signal."""
+    return all(any(given.within(needed) for given in selected) for needed in signal.selected)
+
+
+@dataclass(frozen=True)
 class Message:
-    """A CAN message. Where it is ``per_node``, a unit at node N sends it as
-    ``identifier`` + N. ``length`` in bytes, 0 where it is not known; one of
-    J1939 may be longer than a frame."""
+    """A CAN message, or those of its frames that are ``selected``. Where it is
+    ``per_node``, a unit at node N sends it as ``identifier`` + N. ``length`` in
+    bytes, 0 where it is not known; one of J1939 may be longer than a frame."""
 
     name: str
     identifier: int
@@ -109,6 +149,11 @@ class Message:
     extended: bool = False
     per_node: bool = False
     length: int = 0
+    selected: tuple[Selection, ...] = ()
+
+    @property
+    def title(self) -> str:
+        return f"{self.name} ({', '.join(map(str, self.selected))})" if self.selected else self.name
 
     def identifier_of(self, node_id: int) -> int:
         return self.identifier + node_id if self.per_node else self.identifier
@@ -119,17 +164,28 @@ class Layout:
     """A stream: its messages, the (message, signal) of each channel, and the
     counter in each message.
 
-    ``valid`` are the signals, by message, that have to hold one of
-    ``valid_values``. Where ``by_time``, messages that come within half a period
-    are one sample.
+    The first ``sample`` messages make a sample, all where it is 0; channels of
+    the others take the newest value that is no older than ``latest_s``, by
+    channel. ``valid`` are (message, signal, values): the signals that have to
+    hold one of the values. Where ``by_time``, messages that come within half a
+    period are one sample; where there is a message ``begins``, those from one
+    such message to the next. There a counter is in one message: ``count``.
+    ``stamp`` is (message, signal, seconds of a count).
     """
 
     messages: tuple[Message, ...]
     channels: Mapping[str, tuple[int, Signal]]
-    counters: tuple[Signal, ...]
-    valid: Mapping[int, Signal] = field(default_factory=dict)
-    valid_values: tuple[int, ...] = ()
+    counters: tuple[Signal, ...] = ()
+    valid: tuple[tuple[int, Signal, tuple[int, ...]], ...] = ()
     by_time: bool = False
+    begins: int | None = None
+    count: tuple[int, Signal] | None = None
+    stamp: tuple[int, Signal, float] | None = None
+    sample: int = 0
+    latest_s: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sample", self.sample or len(self.messages))
 
     @property
     def counter_bits(self) -> int:
@@ -139,8 +195,10 @@ class Layout:
         """Bytes that a message must have to hold what the stream takes of it."""
         signals = [s for m, s in self.channels.values() if m == message]
         signals += self.counters[message : message + 1]
-        signals += [self.valid[message]] if message in self.valid else []
-        return max(s.size for s in signals)
+        signals += [s for m, s, _ in self.valid if m == message]
+        signals += [m_s[1] for m_s in (self.count, self.stamp) if m_s is not None and m_s[0] == message]
+        signals += [selection.selector for selection in self.messages[message].selected]
+        return max((s.size for s in signals), default=0)
 
 
 def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> Layout:
@@ -150,26 +208,103 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     needs in any case. Raises ProfileError (one line: ``where``, the name, the
     nearest right one).
     """
-    wanted = stream.wanted()
     index = _Index(messages, getattr(stream, "base_node_id", None) or 0)
-    holders = {name: index.holders(reference, where) for name, (reference, _) in wanted.items()}
-    needed = {h[0][0] for h in holders.values() if len(h) == 1}
+    wanted = stream.wanted()
+    holders = {name: index.holders(w.reference, where) for name, w in wanted.items()}
+    needed = {h[0][0] for name, h in holders.items() if len(h) == 1 and wanted[name].latest_s is None}
     chosen: dict[str, tuple[int, Signal]] = {}
-    for name, (reference, scaling) in wanted.items():
-        found = [h for h in holders[name] if len(holders[name]) == 1 or h[0] in needed]
-        if len(found) != 1:
-            names = ", ".join(index.place(m) for m, _ in holders[name])
-            raise ProfileError(f"{where}: '{reference}' is in several messages ({names}); name one of them")
-        chosen[name] = (found[0][0], _scaled(found[0][1], scaling))
-    order = sorted(needed)
-    used = tuple(messages[m] for m in order)
-    channels = {name: (order.index(m), signal) for name, (m, signal) in chosen.items()}
-    by_time = stream.together == "time"
-    counters = _counters(used, stream.counter, by_time, where)
-    valid = _valid(index, order, stream.validity(), where)
-    _check_identifiers(used, where)
+    for name, w in wanted.items():
+        m, signal = index.one_of(holders[name], needed, w.reference, where)
+        chosen[name] = m, _scaled(signal, w.channel)
+    # Frames of a sample: of its channels, its begin, its counter and its time stamp.
+    parts = _Frames(messages)
+    for name, (m, signal) in chosen.items():
+        if wanted[name].latest_s is None:
+            parts.need(m, signal)
+    begins = index.message(stream.begins, where) if stream.begins else None
+    if begins is not None:
+        parts.need(begins)
+    together = stream.together is not None
+    once = {"counter": stream.counter} if together and stream.counter else {}
+    if (stamp := stream.stamp()) is not None:
+        once["time_stamp"] = stamp[0]
+    found = {key: index.first_of(index.holders(name, where), parts.used, name, where) for key, name in once.items()}
+    for m, signal in found.values():
+        parts.need(m, signal)
+    sample = parts.settle(where)
+    # Frames beside it, which have the newest value of some channels.
+    for m, signal in chosen.values():
+        if parts.place(m, signal) is None:
+            parts.need(m, signal)
+    used = parts.settle(where)
+    _check_identifiers([messages[m] for m in sorted(parts.used)], where)
     _check_lengths(used, where)
-    return Layout(used, channels, counters, *valid, by_time)
+    channels = {name: (parts.place_of(m, signal), signal) for name, (m, signal) in chosen.items()}
+    single = {key: (parts.place_of(m, signal), signal) for key, (m, signal) in found.items()}
+    for key, (_, signal) in single.items():
+        _check_count(signal, key, where)
+    return Layout(
+        used,
+        channels,
+        _counters(sample, None if together else stream.counter, together, where),
+        _valid(index, parts, sample, stream.validity(), where),
+        by_time=stream.together == "time",
+        begins=None if begins is None else parts.place_of(begins),
+        count=single.get("counter"),
+        stamp=(*single["time_stamp"], stamp[1]) if stamp else None,
+        sample=len(sample),
+        latest_s={name: w.latest_s for name, w in wanted.items() if w.latest_s and channels[name][0] >= len(sample)},
+    )
+
+
+class _Frames:
+    """Kinds of frames that a stream takes: messages, of a multiplexed one the frames
+    that are selected. A signal that every frame has is taken from those that
+    another signal needs in any case."""
+
+    def __init__(self, messages: Sequence[Message]) -> None:
+        self._messages = messages
+        self._kinds: list[tuple[int, tuple[Selection, ...]]] = []  # number of the message, and which frames of it
+        self._settled = 0
+
+    @property
+    def used(self) -> set[int]:
+        """Numbers of the messages."""
+        return {m for m, _ in self._kinds}
+
+    def place(self, m: int, signal: Signal | None = None) -> int | None:
+        """The first kind of frame with message ``m`` that holds the signal."""
+        held = (
+            i for i, (n, selected) in enumerate(self._kinds) if n == m and (not signal or _implied(signal, selected))
+        )
+        return next(held, None)
+
+    def place_of(self, m: int, signal: Signal | None = None) -> int:
+        """The same where it has been needed."""
+        found = self.place(m, signal)
+        assert found is not None
+        return found
+
+    def need(self, m: int, signal: Signal | None = None) -> None:
+        if self.place(m, signal) is not None:
+            return
+        selected = signal.selected if signal else ()
+        for i, (n, wider) in enumerate(self._kinds[self._settled :], self._settled):
+            if n == m and all(any(each.within(w) for each in selected) for w in wider):
+                self._kinds[i] = m, selected
+                return
+        self._kinds.append((m, selected))
+
+    def settle(self, where: str) -> tuple[Message, ...]:
+        """All that were needed; those since the last call in the order of the file."""
+        self._kinds[self._settled :] = sorted(self._kinds[self._settled :], key=lambda kind: kind[0])
+        self._settled = len(self._kinds)
+        used = tuple(replace(self._messages[m], selected=selected) for m, selected in self._kinds)
+        for (a, (m, one)), (b, (n, other)) in combinations(enumerate(self._kinds), 2):
+            if m == n and not any(x.apart_from(y) for x in one for y in other):
+                names = " and ".join(f"'{used[i].title}'" for i in (a, b))
+                raise ProfileError(f"{where}: {names} can be the same frame; take the channels from one of them")
+        return used
 
 
 class _Index:
@@ -196,6 +331,32 @@ class _Index:
             known = (s for i in inside for s in self._messages[i].signals)
             raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
         return found
+
+    def one_of(
+        self, holders: Sequence[tuple[int, Signal]], preferred: set[int], reference: str, where: str
+    ) -> tuple[int, Signal]:
+        """The only holder, or the only one among the ``preferred`` messages."""
+        found = [h for h in holders if len(holders) == 1 or h[0] in preferred]
+        if len(found) != 1:
+            names = ", ".join(self.place(m) for m, _ in holders)
+            raise ProfileError(f"{where}: '{reference}' is in several messages ({names}); name one of them")
+        return found[0]
+
+    def first_of(
+        self, holders: Sequence[tuple[int, Signal]], preferred: set[int], reference: str, where: str
+    ) -> tuple[int, Signal]:
+        """The first holder among the ``preferred`` messages, or the only one."""
+        found = [h for h in holders if h[0] in preferred]
+        return found[0] if found else self.one_of(holders, preferred, reference, where)
+
+    def message(self, name: str, where: str) -> int:
+        """The message ``Message`` or ``Message@0x19``."""
+        found = self._named(name, where)
+        if len(found) != 1:
+            raise ProfileError(
+                f"{where}: there are several messages '{name}' ({', '.join(map(self.place, found))}); name one of them"
+            )
+        return found[0]
 
     def _named(self, within: str, where: str) -> Sequence[int]:
         """The messages ``Message`` or ``Message@0x19``."""
@@ -234,48 +395,50 @@ class _Index:
 
 
 def _scaled(signal: Signal, scaling: Scaling) -> Signal:
-    return Signal(
-        signal.name,
-        signal.start,
-        signal.length,
-        signal.big_endian,
-        signal.signed,
-        signal.is_float,
-        signal.scale if scaling.scale is None else scaling.scale,
-        signal.offset if scaling.offset is None else scaling.offset,
+    return replace(
+        signal,
+        scale=signal.scale if scaling.scale is None else scaling.scale,
+        offset=signal.offset if scaling.offset is None else scaling.offset,
     )
 
 
 def _valid(
-    index: _Index, order: Sequence[int], validity: tuple[str, tuple[int, ...]] | None, where: str
-) -> tuple[dict[int, Signal], tuple[int, ...]]:
+    index: _Index,
+    frames: _Frames,
+    sample: Sequence[Message],
+    validity: Sequence[tuple[str, tuple[int, ...]]],
+    where: str,
+) -> tuple[tuple[int, Signal, tuple[int, ...]], ...]:
     """The signals that say whether a sample is valid, by their message's place
-    in ``order``."""
-    if validity is None:
-        return {}, ()
-    name, values = validity
-    found = {order.index(m): signal for m, signal in index.holders(name, where) if m in order}
-    if not found:
-        names = ", ".join(map(index.place, order))
-        raise ProfileError(f"{where}: valid: '{name}' is in no message of the sample ({names})")
-    for signal in found.values():
-        if signal.is_float:
-            raise ProfileError(f"{where}: valid: '{name}' is a float, expected a whole number")
-    return found, values
+    in the sample."""
+    entries = []
+    for name, values in validity:
+        held = [(frames.place(m, signal), signal) for m, signal in index.holders(name, where)]
+        found = [(place, signal) for place, signal in held if place is not None and place < len(sample)]
+        if not found:
+            names = ", ".join(m.title for m in sample)
+            raise ProfileError(f"{where}: valid: '{name}' is in no message of the sample ({names})")
+        for place, signal in found:
+            if signal.is_float:
+                raise ProfileError(f"{where}: valid: '{name}' is a float, expected a whole number")
+            entries.append((place, signal, values))
+    return tuple(entries)
 
 
-def _counters(used: Sequence[Message], counter: str | None, by_time: bool, where: str) -> tuple[Signal, ...]:
+def _counters(used: Sequence[Message], counter: str | None, together: bool, where: str) -> tuple[Signal, ...]:
+    """The counter in each message of the sample."""
     if counter is None:
-        if len(used) > 1 and not by_time:
-            names = ", ".join(m.name for m in used)
+        if len(used) > 1 and not together:
+            names = ", ".join(m.title for m in used)
             raise ProfileError(
-                f'{where}: a sample made of several messages ({names}) needs a counter, or together = "time"'
+                f"{where}: a sample made of several messages ({names}) needs a counter, together = "
+                '{ begins = "…" } or together = "time"'
             )
         return ()
     for message in used:
-        if counter not in message.signals:
+        if counter not in message.signals or not _implied(message.signals[counter], message.selected):
             hint = nearest(counter, message.signals)
-            raise ProfileError(f"{where}: no signal '{counter}' (the counter) in message '{message.name}'{hint}")
+            raise ProfileError(f"{where}: no signal '{counter}' (the counter) in message '{message.title}'{hint}")
     found = tuple(m.signals[counter] for m in used)
     widths = sorted({s.length for s in found})
     if len(widths) > 1 or widths[0] < SHORTEST_COUNTER or widths[0] > 32 or any(s.is_float for s in found):
@@ -284,6 +447,18 @@ def _counters(used: Sequence[Message], counter: str | None, by_time: bool, where
             f"expected an integer of the same {SHORTEST_COUNTER} to 32 bits in every message"
         )
     return found
+
+
+def _check_count(signal: Signal, key: str, where: str) -> None:
+    """Of a counter or time stamp that one message of a sample bears."""
+    most = 32 if key == "counter" else 64
+    least = SHORTEST_COUNTER if key == "counter" else SHORTEST_STAMP
+    if signal.is_float or not least <= signal.length <= most:
+        kind = "float" if signal.is_float else "whole number"
+        raise ProfileError(
+            f"{where}: {key} '{signal.name}' is a {kind} of {signal.length} bits, expected an integer of {least} to "
+            f"{most} bits"
+        )
 
 
 def _check_lengths(used: Sequence[Message], where: str) -> None:
@@ -310,10 +485,11 @@ def _check_identifiers(used: Sequence[Message], where: str) -> None:
 
 J1939_MOST = 1785  # bytes of a J1939 message in 255 packets of seven
 ENTRIES_MOST = 100_000  # messages and signals; a vehicle has tens of thousands
+SELECTORS_MOST = 8  # one above the other; files have two at most
 TOKENS_MOST = 1_000_000  # statements and quoted texts; a vehicle's value tables have some hundred thousand
 
 _TOKEN = re.compile(
-    rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
+    rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_|SG_MUL_VAL_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
     rb"|^(?P<word>[A-Za-z]\w*)",
     re.MULTILINE,
 )
@@ -325,9 +501,11 @@ _KEYWORDS = frozenset(
 _NUMBER = rb"([-+]?(?:\d{1,400}(?:\.\d{0,400})?|\.\d{1,400})(?:[eE][-+]?\d{1,3})?)"
 _MESSAGE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:\s*(\d{1,10})\s")
 _SIGNAL = re.compile(
-    rb"(\w+)\s*(?:\s(M|m\d{1,10}M?)\s*)?:\s*(\d{1,10})\s*\|\s*(\d{1,10})\s*@\s*([01])\s*([-+])"
+    rb"(\w+)\s*(?:\s(?:(M)|m(\d{1,10})(M?))\s*)?:\s*(\d{1,10})\s*\|\s*(\d{1,10})\s*@\s*([01])\s*([-+])"
     rb"\s*\(\s*" + _NUMBER + rb"\s*,\s*" + _NUMBER + rb"\s*\)"
 )
+_SELECTED = re.compile(rb"(\d{1,10})\s+(\w+)\s+(\w+)\s+((?:\d{1,10}\s*-\s*\d{1,10}\s*,?\s*){1,100})")
+_RANGE = re.compile(rb"(\d+)\s*-\s*(\d+)")
 _VALUE_TYPE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:?\s*([0-3])\b")
 _LONG_NAME = re.compile(
     rb'^[ \t]*BA_\s+"System(?:Signal|Message)LongSymbol"\s+(?:BO_|SG_)\s+(\d{1,10})(?:\s+(\w+))?\s*"(\w+)"',
@@ -344,6 +522,10 @@ _DBC_EXTENDED = 1 << 31
 _NO_MESSAGE = 0xC0000000  # what Vector's tools keep signals under that belong to no message
 
 
+_By = tuple[str, tuple[tuple[int, int], ...]]
+"""Name of a signal that selects others, and the ranges (first, last) for one."""
+
+
 @dataclass
 class _Described:
     """A message as the file has it."""
@@ -352,14 +534,39 @@ class _Described:
     name: str
     length: int
     signals: dict[str, Signal] = field(default_factory=dict)
+    selectors: list[str] = field(default_factory=list)  # signals that select others
+    numbers: dict[str, int] = field(default_factory=dict)  # by which a signal says that it is selected
+
+    def settle(self, said: Mapping[str, _By]) -> None:
+        """Says of each multiplexed signal which frames hold it: ``said`` are the
+        selectors and ranges that the file lists, which the short form gives way
+        to. One whose selector is not in the message is dropped."""
+        plain = [name for name in self.selectors if name not in self.numbers]
+        of: dict[str, _By] = {}
+        if len(plain) == 1:
+            of |= {name: (plain[0], ((number, number),)) for name, number in self.numbers.items()}
+        of |= {name: by for name, by in said.items() if name in self.signals and by[0] in self.signals}
+        bare = dict(self.signals)
+        for name in {*self.numbers, *of}:
+            chain = self._chain(name, of, bare)
+            if chain is None:
+                del self.signals[name]
+            else:
+                self.signals[name] = replace(bare[name], selected=chain)
+
+    def _chain(self, name: str, of: Mapping[str, _By], bare: Mapping[str, Signal]) -> tuple[Selection, ...] | None:
+        """What selects the signal, what selects that, and so on."""
+        chain: list[Selection] = []
+        while name in of or name in self.numbers:
+            if name not in of or len(chain) > SELECTORS_MOST:
+                return None
+            name, ranges = of[name]
+            chain.append(Selection(bare[name], ranges))
+        return tuple(chain)
 
 
 def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[Message]:
-    """Every message of a DBC file; multiplexed signals, which only some frames
-    hold, are left out.
-
-    Raises ProfileError.
-    """
+    """Every message of a DBC file. Raises ProfileError."""
     found = _File(data, where).messages()
     if not found:
         raise ProfileError(f"{where}: not a DBC file: there is no message in it (BO_)")
@@ -371,7 +578,8 @@ def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[M
         for signal in m.signals.values():
             name = long.get((m.number, signal.name.encode()), signal.name)
             signals[name] = replace(signal, name=name) if name != signal.name else signal
-            _check(signal, m, where)
+            for each in (signal, *(s.selector for s in signal.selected)):
+                _check(each, m, where)
         extended = bool(m.number & _DBC_EXTENDED)
         identifier = m.number & ~_DBC_EXTENDED
         if identifier > (0x1FFFFFFF if extended else 0x7FF):
@@ -392,23 +600,29 @@ class _File:
     def messages(self) -> list[_Described]:
         messages: list[_Described] = []
         floats: set[tuple[int, str]] = set()
+        selected: dict[int, dict[str, _By]] = {}
         entries = 0
         for kind, rest, at in self._statements():
-            entries += kind != b"SIG_VALTYPE_"
+            entries += kind in (b"BO_", b"SG_")
             if entries > ENTRIES_MOST:
                 self._fail(at, f"more than {ENTRIES_MOST} messages and signals")
             if kind == b"BO_":
                 messages.append(self._message(rest, at))
             elif kind == b"SIG_VALTYPE_":
                 floats |= self._float(rest, at)
+            elif kind == b"SG_MUL_VAL_":
+                number, name, by = self._selection(rest, at)
+                selected.setdefault(number, {})[name] = by
             elif not messages:
                 self._fail(at, "a signal (SG_) of no message")
             else:
-                messages[-1].signals |= self._signal(rest, at)
+                self._add_signal(messages[-1], rest, at)
         for m in messages:
             for name, signal in m.signals.items():
                 if (m.number, name) in floats:
                     m.signals[name] = replace(signal, is_float=True)
+            if m.numbers or m.number in selected:
+                m.settle(selected.get(m.number, {}))
         return [m for m in messages if m.number != _NO_MESSAGE]
 
     def _statements(self) -> Iterator[tuple[bytes, bytes, int]]:
@@ -426,16 +640,29 @@ class _File:
             self._fail(at, "expected BO_ identifier name: bytes sender")
         return _Described(int(m[1]), m[2].decode(), int(m[3]))
 
-    def _signal(self, rest: bytes, at: int) -> dict[str, Signal]:
+    def _add_signal(self, message: _Described, rest: bytes, at: int) -> None:
         m = _SIGNAL.match(rest)
         if m is None:
             self._fail(at, "expected SG_ name : start|length@order sign (scale,offset) […")
-        name, multiplexed = m[1].decode(), (m[2] or b"").startswith(b"m")
-        scale, offset = float(m[7]), float(m[8])
+        name, selects, number, selects_too, start, length, order, sign = (each or b"" for each in m.groups()[:8])
+        scale, offset = float(m[9]), float(m[10])
+        title = name.decode()
         if not (math.isfinite(scale) and math.isfinite(offset)):
-            self._fail(at, f"signal '{clipped(name)}': expected a finite scale and offset")
-        signal = Signal(name, int(m[3]), int(m[4]), m[5] == b"0", m[6] == b"-", False, scale, offset)
-        return {} if multiplexed else {name: signal}
+            self._fail(at, f"signal '{clipped(title)}': expected a finite scale and offset")
+        message.signals[title] = Signal(
+            title, int(start), int(length), order == b"0", sign == b"-", False, scale, offset
+        )
+        if selects or selects_too:
+            message.selectors.append(title)
+        if number:
+            message.numbers[title] = int(number)
+
+    def _selection(self, rest: bytes, at: int) -> tuple[int, str, _By]:
+        m = _SELECTED.match(rest)
+        if m is None:
+            self._fail(at, "expected SG_MUL_VAL_ identifier name selector first-last, …;")
+        ranges = tuple((int(first), int(last)) for first, last in _RANGE.findall(m[4]))
+        return int(m[1]), m[2].decode(), (m[3].decode(), ranges)
 
     def _float(self, rest: bytes, at: int) -> set[tuple[int, str]]:
         m = _VALUE_TYPE.match(rest)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from ipaddress import ip_address
 from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal, Self
@@ -13,7 +14,15 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers.claim import Claim, canonical_port
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.profile import CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict, require_readings
+from triaxcal_drivers.profile import (
+    CHANNELS_MOST,
+    READING_CHANNELS,
+    STREAMS_MOST,
+    Profile,
+    Register,
+    Strict,
+    require_readings,
+)
 from triaxcal_drivers.registers import ByteOrder
 from triaxcal_drivers.toml_text import validate
 
@@ -112,11 +121,19 @@ class Scaling(Strict):
         return self
 
 
-class DbcChannel(Scaling):
+class _Channel(Scaling):
+    latest_s: Annotated[
+        float | None,
+        Field(gt=0, le=3600, description="the newest value before the sample, no older than this"),
+    ] = None
+    """A channel with it comes in a message outside the sample."""
+
+
+class DbcChannel(_Channel):
     signal: Annotated[str, Field(description="name of the signal, Message.Signal, or Message@0x19.Signal")]
 
 
-class PdoChannel(Scaling):
+class PdoChannel(_Channel):
     object: Annotated[ObjectName, Field(description="mapped object, as 0x2300:01")]
 
 
@@ -149,23 +166,80 @@ def _named(key: str, channel: type[Strict]) -> BeforeValidator:
     )
 
 
+def _several(key: str, validity: type[Strict]) -> BeforeValidator:
+    """One or a list, each of which may be given by its name in the file alone."""
+
+    def listed(given: object) -> object:
+        every = given if isinstance(given, list | tuple) else [given]
+        return tuple({key: each} if isinstance(each, str) else each for each in every)
+
+    return BeforeValidator(listed, json_schema_input_type=str | validity | list[str | validity])  # type: ignore[valid-type]
+
+
+STAMPS_LEAST = 2
+"""Counts of a time stamp from one sample to the next, at least: with fewer, two
+samples of a device that is somewhat faster than it says may have one stamp."""
+VALID_MOST = 16  # signals of one stream that say what is valid; three axes have a state each
+
+
+class Begins(Strict):
+    """A sample begins with that message and takes each other one once before the
+    next begin, within one period."""
+
+    begins: Annotated[str, Field(description="name of the message, or Message@0x19")]
+
+
 Together = Annotated[
-    Literal["time"] | None,
-    Field(description="without a counter: messages that come within half a period of each other are one sample"),
+    Literal["time"] | Begins | None,
+    Field(
+        description='without a counter in every message: "time" joins messages that come within half a period of each '
+        'other; { begins = "Message" } joins those from one such message to the next'
+    ),
 ]
 
 
+class _StampBy(Strict):
+    """The device's time of a sample; it wraps with the width of its signal."""
+
+    unit_s: Annotated[float, Field(gt=0, le=3600, description="seconds a count: 1e-6, 0.001…")]
+
+
+class DbcStamp(_StampBy):
+    signal: Annotated[str, Field(description="name of the signal, or Message.Signal; unscaled")]
+
+
+class PdoStamp(_StampBy):
+    object: Annotated[ObjectName, Field(description="mapped object, as 0x2300:01; unscaled")]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A channel by its name in the file."""
+
+    reference: str
+    channel: Scaling
+    latest_s: float | None = None
+
+
 class _Stream(Strict):
-    counter: Annotated[str | None, Field(description="signal that all messages of a sample bear")] = None
+    counter: Annotated[
+        str | None, Field(description="signal that all messages of a sample bear, or with `together` one of them")
+    ] = None
     together: Together = None
     channels: Mapping[str, Scaling]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
         require_readings(self.channels)
-        if self.counter is not None and self.together is not None:
-            raise ValueError("together is for messages without a counter, and there is one")
+        for name in READING_CHANNELS:
+            if getattr(self.channels[name], "latest_s", None) is not None:
+                raise ValueError(f"channels.{name}: latest_s is for other channels than ux, uy and uz")
         return self
+
+    @property
+    def begins(self) -> str | None:
+        """The message that a sample begins with."""
+        return self.together.begins if isinstance(self.together, Begins) else None
 
 
 class DbcStream(_Stream):
@@ -184,19 +258,30 @@ class DbcStream(_Stream):
         int | None, Field(ge=1, le=127, description="node of the DBC's identifiers; at another node they shift")
     ] = None
     valid: Annotated[
-        DbcValidity | None, _named("signal", DbcValidity), Field(description="signal that says whether a sample counts")
-    ] = None
+        tuple[DbcValidity, ...],
+        _several("signal", DbcValidity),
+        Field(
+            strict=False,
+            max_length=VALID_MOST,
+            description="signal that says whether a sample counts; of several all must say so",
+        ),
+    ] = ()
+    time_stamp: Annotated[DbcStamp | None, Field(description="the device's time of a sample")] = None
     channels: Annotated[
         Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]], Field(max_length=CHANNELS_MOST)
     ]
 
-    def wanted(self) -> dict[str, tuple[str, Scaling]]:
-        """The name in the file, and the scaling, of each channel."""
-        return {name: (channel.signal, channel) for name, channel in self.channels.items()}
+    def wanted(self) -> dict[str, Wanted]:
+        """Each channel."""
+        return {name: Wanted(c.signal, c, c.latest_s) for name, c in self.channels.items()}
 
-    def validity(self) -> tuple[str, tuple[int, ...]] | None:
-        """The name in the file, and the unscaled numbers of valid samples."""
-        return (self.valid.signal, self.valid.values) if self.valid else None
+    def validity(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        """Names in the file, and the unscaled numbers of valid samples."""
+        return tuple((valid.signal, valid.values) for valid in self.valid)
+
+    def stamp(self) -> tuple[str, float] | None:
+        """The time stamp's name in the file, and the seconds of a count."""
+        return (self.time_stamp.signal, self.time_stamp.unit_s) if self.time_stamp else None
 
 
 class PdoStream(_Stream):
@@ -207,8 +292,15 @@ class PdoStream(_Stream):
     eds: Annotated[str, Field(description="the EDS file, in the profile's folder or below it")]
     counter: Annotated[ObjectName | None, Field(description="object that all messages of a sample bear")] = None
     valid: Annotated[
-        PdoValidity | None, _named("object", PdoValidity), Field(description="object that says whether a sample counts")
-    ] = None
+        tuple[PdoValidity, ...],
+        _several("object", PdoValidity),
+        Field(
+            strict=False,
+            max_length=VALID_MOST,
+            description="object that says whether a sample counts; of several all must say so",
+        ),
+    ] = ()
+    time_stamp: Annotated[PdoStamp | None, Field(description="the device's time of a sample")] = None
     channels: Annotated[
         Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]], Field(max_length=CHANNELS_MOST)
     ]
@@ -217,13 +309,17 @@ class PdoStream(_Stream):
     def file(self) -> str:
         return self.eds
 
-    def wanted(self) -> dict[str, tuple[str, Scaling]]:
-        """The object's name, and the scaling, of each channel."""
-        return {name: (channel.object, channel) for name, channel in self.channels.items()}
+    def wanted(self) -> dict[str, Wanted]:
+        """Each channel."""
+        return {name: Wanted(c.object, c, c.latest_s) for name, c in self.channels.items()}
 
-    def validity(self) -> tuple[str, tuple[int, ...]] | None:
-        """The object's name, and the unscaled numbers of valid samples."""
-        return (self.valid.object, self.valid.values) if self.valid else None
+    def validity(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        """Names in the file, and the unscaled numbers of valid samples."""
+        return tuple((valid.object, valid.values) for valid in self.valid)
+
+    def stamp(self) -> tuple[str, float] | None:
+        """The time stamp's name in the file, and the seconds of a count."""
+        return (self.time_stamp.object, self.time_stamp.unit_s) if self.time_stamp else None
 
 
 CanStream = Annotated[DbcStream | PdoStream, Field(discriminator="layout")]
@@ -248,6 +344,17 @@ class CanProfile(Profile):
     ] = (0x08000022,)
     """By default "because of the present device state"; a write refused by it
     may as well be locked."""
+
+    @model_validator(mode="after")
+    def _fine_stamps(self) -> Self:
+        for name, stream in self.streams.items():
+            stamp, period_s = stream.time_stamp, 1 / self.sampling.rate_hz
+            if stamp and stamp.unit_s > period_s / STAMPS_LEAST:
+                raise ValueError(
+                    f"streams.{name}.time_stamp: a count of {stamp.unit_s:g} s does not tell samples apart that come "
+                    f"every {period_s:g} s; leave it out"
+                )
+        return self
 
     @property
     def canopen(self) -> bool:

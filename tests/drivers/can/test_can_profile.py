@@ -59,13 +59,9 @@ def test_a_counter_of_differing_width_is_refused(edited: Edited) -> None:
 def test_a_sample_of_several_messages_needs_a_counter(edited: Edited) -> None:
     message = refusal(opened(edited(('counter = "Counter"\n', ""))))
     assert message.endswith(
-        'a sample made of several messages (ReadingsXY, ReadingsZ) needs a counter, or together = "time"'
+        "a sample made of several messages (ReadingsXY, ReadingsZ) needs a counter, "
+        'together = { begins = "…" } or together = "time"'
     )
-
-
-def test_a_counter_and_time_do_not_both_say_what_is_one_sample(edited: Edited) -> None:
-    message = refusal(lambda: edited(('counter = "Counter"\n', 'counter = "Counter"\ntogether = "time"\n')))
-    assert "together is for messages without a counter, and there is one" in message
 
 
 @pytest.mark.parametrize(

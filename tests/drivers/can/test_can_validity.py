@@ -32,7 +32,7 @@ def decoded(layout: Layout, records: Sequence[Record], cuts: Sequence[int] = ())
 
 
 def together(values: tuple[int, ...]) -> Layout:
-    return Layout((XY, Z), CHANNELS, (), {0: XY.signals["v"]}, values, by_time=True)
+    return Layout((XY, Z), CHANNELS, valid=((0, XY.signals["v"], values),), by_time=True)
 
 
 @pytest.mark.parametrize(("values", "kept"), [((1,), [1, 4]), ((0,), [3]), ((1, 2), [1, 2, 4])])
@@ -40,7 +40,7 @@ def test_a_sample_is_valid_whose_signal_holds_one_of_the_values(values: tuple[in
     one = Message("M", 0x10, {**XY.signals, "uz": Signal("uz", 24, 8)})
     channels = {n: (0, one.signals[n]) for n in ("ux", "uy", "uz")}
     records = [(10 * MS * x, 0x10, 0, bytes([x, x, v, x])) for x, v in ((1, 1), (2, 2), (3, 0), (4, 1))]
-    (block,) = decoded(Layout((one,), channels, (), {0: one.signals["v"]}, values), records)
+    (block,) = decoded(Layout((one,), channels, valid=((0, one.signals["v"], values),)), records)
     assert block.readings[:, 0].tolist() == kept
     assert block.time_ns.tolist() == [10 * MS * x for x in kept]
     assert block.invalid == 4 - len(kept)
