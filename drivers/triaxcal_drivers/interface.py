@@ -237,7 +237,8 @@ class Device(Protocol):
         """One request; ``timeout_s`` takes the place of the profile's
         ``reply_timeout_s``. Raises as `read` does.
 
-        A driver that can tell has a method ``listen`` as `Listens` does."""
+        A driver that can tell has a method ``listen`` as `Listens` does, one on CAN
+        a method ``send`` as `Sends` does."""
 
 
 class Listens(Protocol):
@@ -247,6 +248,13 @@ class Listens(Protocol):
         """Waits so long by the host's clock. Returns the answers since the last
         call that no request explains: of a second unit at the same address, or
         to another program."""
+
+
+class Sends(Protocol):
+    """A device that takes CAN frames."""
+
+    async def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
+        """Raises BusError."""
 
 
 class Driver(Protocol):

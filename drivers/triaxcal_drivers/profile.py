@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, FailFast, Field, Tag, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.hints import nearest
@@ -24,6 +24,7 @@ from triaxcal_drivers.roles import (
     CORRECTION,
     CORRECTION_GROUPS,
     CORRECTION_ROLES,
+    NOT_CALIBRATION,
     OFFSET_ROLES,
     OTHER_ROLES,
     REFERENCE_ROLE,
@@ -172,13 +173,71 @@ class ReconnectStep(Strict):
     timeout_s: Annotated[float, Field(gt=0, le=120, description="how long to try")] = 5.0
 
 
+class SendStep(Strict):
+    send: Annotated[str, Field(pattern=r"^0x[0-9A-Fa-f]{1,8}$", description='identifier of the CAN frame: "0x050"')]
+    data: Annotated[
+        str,
+        Field(pattern=r"^([0-9A-Fa-f]{2}( ?[0-9A-Fa-f]{2}){0,7})?$", description='its bytes: "FF AA 03 09 00"'),
+    ] = ""
+    extended: Annotated[bool, Field(description="whether the identifier has 29 bits")] = False
+
+    @model_validator(mode="after")
+    def _on_the_bus(self) -> Self:
+        if self.identifier > (0x1FFFFFFF if self.extended else 0x7FF):
+            hint = "" if self.extended or self.identifier > 0x1FFFFFFF else "; set extended = true"
+            raise ValueError(f"send: {self.send} is no identifier of {29 if self.extended else 11} bits{hint}")
+        return self
+
+    @property
+    def identifier(self) -> int:
+        return int(self.send, 16)
+
+    @property
+    def octets(self) -> bytes:
+        return bytes.fromhex(self.data)
+
+
 Step = WriteStep | WaitStep | PollStep | ReconnectStep
-Steps = Annotated[tuple[Step, ...], Field(max_length=STEPS_MOST), FailFast()]  # a step has a dozen faults at once
+_KEYS = {"write": WriteStep, "wait_s": WaitStep, "poll": PollStep, "reconnect": ReconnectStep, "send": SendStep}
+"""The key that every step of a kind has."""
+
+
+def _kind(step: object) -> str | None:
+    """Name of the model of a step, so that a fault is told of that kind alone."""
+    if isinstance(step, Mapping):
+        return next((model.__name__ for key, model in _KEYS.items() if key in step), None)
+    return type(step).__name__
+
+
+_BY_KEY = Discriminator(
+    _kind, custom_error_type="step", custom_error_message=f"expected a step with one of the keys {', '.join(_KEYS)}"
+)
+_Tagged = (
+    Annotated[WriteStep, Tag("WriteStep")]
+    | Annotated[WaitStep, Tag("WaitStep")]
+    | Annotated[PollStep, Tag("PollStep")]
+    | Annotated[ReconnectStep, Tag("ReconnectStep")]
+)
+Steps = Annotated[
+    tuple[Annotated[_Tagged, _BY_KEY], ...], Field(max_length=STEPS_MOST), FailFast()
+]  # a step has a dozen faults at once
+StartSteps = Annotated[
+    tuple[Annotated[_Tagged | Annotated[SendStep, Tag("SendStep")], _BY_KEY], ...],
+    Field(max_length=STEPS_MOST),
+    FailFast(),
+]
+
+
+SEQUENCES = ("start", "unlock", "store", "lock", "reset")
 
 
 class Sequences(Strict):
-    """What to do before writing, to make it permanent, after writing, and to
-    start the device afresh."""
+    """What to do before the device streams, before writing, to make it permanent,
+    after writing, and to start the device afresh."""
+
+    start: Annotated[
+        StartSteps, Field(description="steps after the identification, before each stream and after each restart")
+    ] = ()
 
     unlock: Annotated[Steps, Field(description="steps before writing")] = ()
     store: Annotated[Steps, Field(description="steps that make writes last; without any, each write lasts")] = ()
@@ -233,6 +292,10 @@ ONE_UNIT = 0.5
 corrected ones are in the same unit: no other unit of acceleration is so near."""
 
 
+def _holds_calibration(role: str | None) -> bool:
+    return role is not None and role not in NOT_CALIBRATION
+
+
 def _is_of_form(role: str | None) -> bool:
     return role is not None and role.partition(".")[0] in CORRECTION
 
@@ -242,6 +305,8 @@ class Profile(Strict):
 
     wire_order: ClassVar[codec.ByteOrder] = "big"
     """Of the bytes that a driver reads and writes for a register."""
+    sends: ClassVar[bool] = False
+    """Whether its devices take frames by `SendStep`."""
 
     format: Annotated[Literal["triaxcal.profile/1"], Field(description="always this text")]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", description="lower case, digits, ., _ and -")]
@@ -262,12 +327,14 @@ class Profile(Strict):
             raise ValueError(f"streams.{READINGS} is missing")
         named = [("identity.serial_register", self.identity.serial_register)] if self.identity.serial_register else []
         named += [("identity.expect", n) for n in self.identity.expect]
-        for label in ("unlock", "store", "lock", "reset"):
+        for label in SEQUENCES:
             for step in getattr(self.sequences, label):
                 if isinstance(step, WriteStep):
                     named.append((f"sequences.{label}", step.write))
                 elif isinstance(step, PollStep):
                     named.append((f"sequences.{label}", step.poll))
+                elif isinstance(step, SendStep) and not self.sends:
+                    raise ValueError(f"sequences.{label}: send is for devices on CAN; write a register")
         if self.crc:
             named += [("crc", n) for n in (self.crc.register_name, *self.crc.over)]
         for where, name in named:
@@ -275,6 +342,11 @@ class Profile(Strict):
                 raise ValueError(f"{where}: no register named '{name}'{nearest(name, self.registers)}")
             if self.registers[name].type == ASCII and where != "identity.serial_register":
                 raise ValueError(f'{where}: register {name} holds text (type "ascii"), where a number is needed')
+        for step in self.sequences.start:
+            if isinstance(step, WriteStep) and _holds_calibration(self.registers[step.write].role):
+                raise ValueError(
+                    f"sequences.start: register {step.write} holds calibration; only provisioning writes it"
+                )
         roles = Counter(r.role for r in self.registers.values() if r.role)
         for role in sorted(r for r, count in roles.items() if count > 1):
             raise ValueError(f"registers: role '{role}' is given twice")

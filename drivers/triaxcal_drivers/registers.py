@@ -120,6 +120,8 @@ class Floating:
 
 
 TYPES: Mapping[str, RegisterType] = {
+    "int8": Integer(1, signed=True),
+    "uint8": Integer(1, signed=False),
     "int16": Integer(2, signed=True),
     "uint16": Integer(2, signed=False),
     "int24": Integer(3, signed=True),

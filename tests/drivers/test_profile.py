@@ -101,7 +101,7 @@ def test_a_good_profile_is_read():
         ("rate_hz = 100.0", "rate_hz = 0.0", "sampling.rate_hz: input should be greater than 0, not 0"),
         ("rate_hz = 100.0", "rate_hz = nan", "sampling.rate_hz"),
         ('bias_x = { address = 8, type = "float32"', 'bias_x = { address = 8, type = "real"',
-         "registers.bias_x.type: input should be 'int16', 'uint16'"),
+         "registers.bias_x.type: input should be 'int8', 'uint8'"),
         ("[-2.4, -2.4, -2.4]", "[-2.4, -2.4]", "output.nominal_scale_factor.2: missing"),
         ("[-2.4, -2.4, -2.4]", "[-2.4, -2.4, -2.4, 1.0]", "output.nominal_scale_factor: tuple should have at most 3"),
         ("minimum = -0.5, maximum = 0.5", "minimum = 0.5, maximum = -0.5",

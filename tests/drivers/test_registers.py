@@ -16,6 +16,8 @@ from triaxcal_drivers.profile import Register
 from triaxcal_drivers.registers import TYPES, crc, decode, encode, in_words, next_in_words, raw_number, step
 
 LITERAL = {
+    "int8": (-2, "FE"),
+    "uint8": (0xFE, "FE"),
     "int16": (-2, "FFFE"),
     "uint16": (0x5A17, "5A17"),
     "int24": (-3, "FFFFFD"),
@@ -130,7 +132,12 @@ def test_many_at_once_are_the_same_numbers_as_one_by_one(name, data):
 
 
 def test_a_type_that_fills_no_words_has_the_next_that_does():
-    assert [(n, next_in_words(n)) for n in TYPES if not in_words(n)] == [("int24", "int32"), ("uint24", "uint32")]
+    assert [(n, next_in_words(n)) for n in TYPES if not in_words(n)] == [
+        ("int8", "int16"),
+        ("uint8", "uint16"),
+        ("int24", "int32"),
+        ("uint24", "uint32"),
+    ]
 
 
 def test_types_are_all_different():

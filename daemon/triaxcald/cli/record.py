@@ -127,7 +127,8 @@ def _recorded(a: argparse.Namespace) -> int:
 def _load(a: argparse.Namespace) -> _Chosen:
     """Raises InputError, ProfileError, DriverMissing."""
     station = load_station(a.station)
-    chosen = _Chosen(station, *_of_station(station, a.unit, a.output, a.folder))
+    places, buses = _of_station(station, a.unit, a.output, a.folder)
+    chosen = _Chosen(station, [replace(place, start=not a.no_start) for place in places], buses)
     check_lines(chosen.places, chosen.buses, where=str(station.path))
     return chosen
 

@@ -378,6 +378,7 @@ def _line(commands: Any) -> None:
     p.add_argument(
         "--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit or a bus; default: without end"
     )
+    p.add_argument("--no-start", action="store_true", help="send no start sequence of the profile")
     p.add_argument(
         "--segment-size", type=size, metavar="SIZE", help="a new file after so much, as 256M, with a manifest"
     )

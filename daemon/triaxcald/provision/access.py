@@ -1,6 +1,6 @@
 """Register access: repeats the requests that may be repeated, waits for a busy
-device, and records every request; and the profile's sequences: unlock, store,
-lock, reset."""
+device, and records every request; and the profile's sequences: start,
+unlock, store, lock, reset."""
 
 from __future__ import annotations
 
@@ -96,6 +96,8 @@ class RegisterLink:
         register's own value again."""
         self.before_probe: Callable[[], None] = lambda: None
         """Called before the restart check writes. Raises DiskError."""
+        self.sent: Callable[[td.SendStep], None] = lambda step: None
+        """Called after each frame of a sequence."""
 
     async def open(self) -> None:
         try:
@@ -159,6 +161,11 @@ class RegisterLink:
             await self._write(register, raw, timeout_s)
         else:
             await self._patiently("write", lambda: self._write(register, raw, timeout_s))
+
+    async def send(self, step: td.SendStep) -> None:
+        """Raises BusError."""
+        await self._device.send(step.identifier, step.octets, extended=step.extended)  # type: ignore[attr-defined]
+        self.sent(step)
 
     async def renew(self) -> None:
         """Open a new connection if possible."""
@@ -234,9 +241,9 @@ class RegisterLink:
             raise td.BusError(why) from e
 
 
-# Carries out the profile's sequences: unlock, store, lock, reset.
+# Carries out the profile's sequences: start, unlock, store, lock, reset.
 
-Label = Literal["unlock", "store", "lock", "reset"]
+Label = Literal["start", "unlock", "store", "lock", "reset"]
 POLL_S, RETRY_S = 0.02, 0.1
 RECONNECT_S = 5.0
 """Time for a device to answer again after a loss of power; after that a person has
@@ -260,13 +267,17 @@ async def run_sequence(link: RegisterLink, bundle: td.Bundle, label: Label) -> b
     return await run_steps(link, bundle, label, getattr(bundle.profile.sequences, label))
 
 
-async def run_steps(link: RegisterLink, bundle: td.Bundle, label: Label, steps: Sequence[td.Step]) -> bool:
+async def run_steps(
+    link: RegisterLink, bundle: td.Bundle, label: Label, steps: Sequence[td.Step | td.SendStep]
+) -> bool:
     acknowledged = True
     for step, following in zip(steps, (*steps[1:], None), strict=False):
         match step:
             case td.WriteStep():
                 restarts = isinstance(following, (td.WaitStep, td.ReconnectStep)) and label == "reset"
                 acknowledged &= await _written(link, bundle, step, open_ended=label == "store" or restarts)
+            case td.SendStep():
+                await link.send(step)
             case td.WaitStep():
                 await link.clock.sleep(step.wait_s)
             case td.PollStep():

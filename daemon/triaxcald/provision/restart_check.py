@@ -23,7 +23,7 @@ from triaxcald.provision.identity import WrongUnit, check_identity
 ATTEMPTS = 2
 """A restart command may get lost, and the link does not repeat it. The second
 attempt uses another probe."""
-SEQUENCES: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
+SEQUENCES: tuple[Label, ...] = ("start", "unlock", "store", "lock", "reset")
 BITS = (1, 2, 4)
 """Bits by which a probe may differ from the register's value: one for each attempt,
 and one in reserve for a value that equals a stored one."""
@@ -162,7 +162,7 @@ def _names(profile: td.Profile, known: Collection[Mapping[str, bytes]]) -> Itera
 def may_probe(profile: td.Profile) -> bool:
     """Whether a register may get a probe: no write lasts without the store, and no
     other sequence stores."""
-    elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset")
+    elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset") | writes_of(profile, "start")
     store = writes_of(profile, "store") - writes_of(profile, "unlock")
     return bool(store) and not store & elsewhere
 

@@ -28,6 +28,7 @@ from triaxcald.station.collection import Progress, Recorded
 from triaxcald.station.config import Place, SerialsSeen, Station
 from triaxcald.station.output_check import Confirmation
 from triaxcald.station.reconnect import HOLE_S, ReconnectingDevice, RetryPolicy, Streaming
+from triaxcald.station.starting import StartingDevice
 from triaxcald.utc import file_stamp
 
 
@@ -113,6 +114,8 @@ class UnitSession:
     ) -> Confirmation:
         """Confirmation of a unit that was just identified, before ``recorded`` takes
         its records."""
+        if isinstance(device, StartingDevice):
+            device.writer = writer
         told = self.profile.identity
         asked = partial(self._require_same, device, identity) if told.serial_register or told.expect else None
         return Confirmation(asked, writer, recorded, lambda why: self.progress.note(self.name, text.unidentified(why)))

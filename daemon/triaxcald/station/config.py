@@ -26,6 +26,7 @@ from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places,
 from triaxcald.station.faces import OWN_NAMES
 from triaxcald.station.reconnect import RetryPolicy, claimed, until_open
 from triaxcald.station.simulators import others_at
+from triaxcald.station.starting import StartingDevice
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -384,11 +385,13 @@ def _farthest_apart_deg(count: int) -> float:
 
 @dataclass(frozen=True)
 class Place:
-    """A unit with its profile and its bus settings."""
+    """A unit with its profile and its bus settings; its start sequence is left out
+    without ``start``."""
 
     unit: Unit
     bundle: td.Bundle
     bus: BaseModel
+    start: bool = True
 
     @property
     def address(self) -> str:
@@ -421,6 +424,8 @@ class Place:
         error names the simulators of this machine at the place.
         """
         device = self.device()
+        if self.start and self.bundle.profile.sequences.start:
+            device = StartingDevice(device, self.bundle, self.device_name)
 
         async def attempt() -> None:
             await device.open()

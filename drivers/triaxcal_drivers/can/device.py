@@ -36,6 +36,7 @@ from triaxcal_drivers.two_senders import Answers, ExtraAnswer
 T = TypeVar("T")
 
 _NMT_START = 1
+_SYNC = 0x080
 _HEARTBEAT, _BOOTED = 0x700, b"\0"
 """CiA 301: a node sends a heartbeat of state 0 after booting."""
 _BOOT_LOOK_S = 0.1
@@ -214,9 +215,9 @@ class CanDevice:
         A node that was stopped answers no SDO, one that is still booting misses
         the command: it is sent before and after the check.
         """
-        await self._send(0, bytes([_NMT_START, self._settings.node_id]))
+        await self.send(0, bytes([_NMT_START, self._settings.node_id]))
         await self._identify()
-        await self._send(0, bytes([_NMT_START, self._settings.node_id]))
+        await self.send(0, bytes([_NMT_START, self._settings.node_id]))
 
     async def _identify(self) -> None:
         identity = self._profile.identity
@@ -259,6 +260,8 @@ class CanDevice:
         connection.line.hear(frames)
         timeout_s = self._profile.sampling.silence_timeout_s
         deadline_s = now_s() + timeout_s
+        asked = [p for name in names if (p := self._profile.streams[name].sync_period_s) is not None]
+        sync = asyncio.create_task(self._sync(min(asked))) if asked else None
         try:
             while True:
                 batch = await frames.batch(min(deadline_s - now_s(), _BOOT_LOOK_S))
@@ -273,6 +276,8 @@ class CanDevice:
                 if silent:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
+            if sync is not None:
+                sync.cancel()
             if frames.close(opened):
                 self._booted = None
                 connection.line.unhear(frames)
@@ -334,8 +339,20 @@ class CanDevice:
         except BusError as e:
             raise BusError(f"{place}: {e}") from e
 
-    async def _send(self, identifier: int, data: bytes) -> None:
-        await asyncio.to_thread(self._connected().line.send, identifier, data)
+    async def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
+        """Raises BusError."""
+        await asyncio.to_thread(self._connected().line.send, identifier, data, extended=extended)
+
+    async def _sync(self, period_s: float) -> None:
+        """Send SYNC every ``period_s``, until cancelled. A dead bus is told by the
+        stream."""
+        loop = asyncio.get_running_loop()
+        next_s = loop.time()
+        while True:
+            with suppress(BusError):
+                await self.send(_SYNC, b"")
+            next_s = max(next_s + period_s, loop.time())
+            await asyncio.sleep(next_s - loop.time())
 
 
 def _on_the_wire(name: str) -> bytes:

@@ -326,16 +326,16 @@ class CanLine:
         if self._failure is not None:
             raise BusError(str(self._failure)) from self._failure
 
-    def send(self, identifier: int, data: bytes) -> None:
+    def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
         """Blocking. Raises BusError."""
         adapter = self._adapter
         if adapter is None:
             self.check()
             raise BusError(f"{self.name} is not open")
         sent_ns = HOST.now_ns()
-        adapter.send(identifier, data)
+        adapter.send(identifier, data, extended=extended)
         if not adapter.echoes:
-            frame = Frame(sent_ns, identifier, RawFlag.SENT, data)
+            frame = Frame(sent_ns, identifier, RawFlag.SENT | (RawFlag.EXTENDED_ID if extended else 0), data)
             for queue in self._queues:
                 if queue.identifiers is None:
                     queue.put([frame])

@@ -226,6 +226,9 @@ class _Stream(Strict):
         str | None, Field(description="signal that all messages of a sample bear, or with `together` one of them")
     ] = None
     together: Together = None
+    sync_period_s: Annotated[
+        float | None, Field(ge=0.001, le=60, description="SYNC is sent so often while the stream is read (CiA 301)")
+    ] = None
     channels: Mapping[str, Scaling]
 
     @model_validator(mode="after")
@@ -337,6 +340,7 @@ class CanProfile(Profile):
     taken for a CANopen node."""
 
     wire_order: ClassVar[ByteOrder] = "little"
+    sends: ClassVar[bool] = True
     streams: Annotated[Mapping[str, CanStream], Field(max_length=STREAMS_MOST)]
     registers: Mapping[str, CanRegister] = {}
     busy_codes: Annotated[
