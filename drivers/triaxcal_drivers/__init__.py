@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from triaxcal_drivers.catalogue import BUILT_IN, driver_named, listed, load_bundle, parse_bundle
     from triaxcal_drivers.claim import Claim, canonical_host, claim_of, is_name
     from triaxcal_drivers.errors import (
+        AddressError,
         BusError,
         DeviceAbsent,
         DeviceBusy,
@@ -92,6 +93,7 @@ _NAMES = {
         "is_name",
     ),
     "errors": (
+        "AddressError",
         "BusError",
         "DeviceAbsent",
         "DeviceBusy",
@@ -139,6 +141,7 @@ __all__ = [
     "CORRECTED",
     "READINGS",
     "SCALE_FACTOR_RATIO",
+    "AddressError",
     "Bundle",
     "BusError",
     "Claim",

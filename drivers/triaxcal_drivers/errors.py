@@ -13,6 +13,11 @@ class ProfileError(DriverError):
     """The profile, or a file it names (DBC, EDS), is wrong."""
 
 
+class AddressError(ProfileError):
+    """The settings of a unit's bus lack its address, or have one that its profile has
+    no use for."""
+
+
 class DriverMissing(DriverError):
     """No driver of that name is installed, or it cannot be imported."""
 

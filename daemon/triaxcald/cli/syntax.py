@@ -151,7 +151,7 @@ def count(text: str) -> int:
     return int(text)
 
 
-def seed(text: str) -> int:
+def whole(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, not '{text}'")
     return int(text)
@@ -309,7 +309,7 @@ def _line(commands: Any) -> None:
         "demo --out demo-out",
     )  # fmt: skip
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
-    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses; default: 1")
+    p.add_argument("--seed", type=whole, default=1, help="of the units' hidden effects, noise and poses; default: 1")
     p.add_argument(
         "--page",
         action="store_true",
@@ -791,6 +791,9 @@ def _audits(commands: Any) -> None:
         help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
     )  # fmt: skip
     p.add_argument(
-        "--node", type=count, metavar="N", help="the unit's, where identifiers shift with it and several nodes send"
+        "--node",
+        type=whole,
+        metavar="N",
+        help="the unit's node, where identifiers shift with it, or its source address (J1939), where several send",
     )
     add_json(p)

@@ -57,6 +57,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         self._nodes: dict[Key, int | None] = {}  # by identifier; None where it does not shift
+        self._groups = {m.group for layout in self.layouts.values() for m in layout.messages if m.j1939}
         for layout in self.layouts.values():
             for message in layout.messages:
                 self._nodes |= _identifiers(message)
@@ -81,6 +82,8 @@ class Selection:
             self.error_frames += 1
             return True
         key = frame.source, frame.flags & _EXTENDED
+        if self._groups and key not in self._nodes:
+            self._meet(key)
         if key not in self._nodes:
             self.others[key if key in self.others or len(self.others) < KEPT_APART else _FURTHER] += 1
             return False
@@ -93,6 +96,21 @@ class Selection:
         self._of_unit.add(frame.channel)
         self.taken += 1
         return True
+
+    def _meet(self, key: Key) -> None:
+        """Note the identifier where it is of a parameter group of J1939: its source
+        address is the node."""
+        source, extended = key
+        if extended and any(source & bits == group for bits, group in self._groups):
+            self._nodes[key] = source & 0xFF
+            for keys, counted in ((self._readings, False), (self._counted, True)):
+                if any(source & bits == group for bits, group in self._groups_of(counted=counted)):
+                    keys.add(key)
+
+    def _groups_of(self, *, counted: bool) -> set[tuple[int, int]]:
+        """Of the readings, or of all streams with a counter."""
+        layouts = self.layouts.values() if counted else [self.layouts[td.READINGS]]
+        return {m.group for layout in layouts if layout.counters or not counted for m in layout.messages if m.j1939}
 
     def is_reading(self, frame: td.logs.LoggedFrame) -> bool:
         """Whether it is one of the messages that make a sample of the
@@ -108,7 +126,7 @@ class Selection:
         seen. Raises InputError where that is not one unit's, or none."""
         if self.channel is not None and self.channel not in self.channels:
             raise InputError(f"--channel {self.channel}: {name} has {_listed(self.channels)}")
-        if self.node is not None and not any(node is not None for node in self._nodes.values()):
+        if self.node is not None and not self._groups and all(node is None for node in self._nodes.values()):
             raise InputError(f"--node {self.node}: the identifiers of the profile are the same for all nodes")
         nodes = Counter(self._strangers)
         for (key, _), count in self._seen.items():
@@ -143,7 +161,8 @@ class Selection:
         for message in (m for layout in self.layouts.values() for m in layout.messages):
             key = message.identifier_of(self.node or 0), _EXTENDED if message.extended else 0
             shifts = message.per_node and self.node is None
-            shown.append(_identifiers_shown([key]) + (" + node" if shifts else ""))
+            any_source = message.j1939 and self.node is None
+            shown.append(_identifiers_shown([key]) + (" + node" if shifts else " of any source" if any_source else ""))
         return list(dict.fromkeys(shown))
 
     @property
@@ -154,6 +173,8 @@ class Selection:
 
 def _identifiers(message: td.can.Message) -> dict[Key, int | None]:
     flag = _EXTENDED if message.extended else 0
+    if message.j1939:
+        return {}
     if not message.per_node:
         return {(message.identifier, flag): None}
     return {(message.identifier + node, flag): node for node in range(1, td.can.NODES + 1)}

@@ -132,7 +132,9 @@ class CanUnit:
         self._unit = unit
         self._time = time_base
         self._settings = bus
-        self._node_id = bus.node_id
+        if bus.node_id is None:
+            raise td.AddressError("bus: node_id: missing, 1 to 127")
+        self._node_id: int = bus.node_id
         self._state = _BOOT_UP
         self._started_s: float | None = None  # of the start that was announced by a boot-up message
         self._heartbeat_s = 0.0

@@ -511,7 +511,10 @@ def load_station(path: Path) -> Station:
             )
         _check_roles(bundle, where=f"{path}: units.{i}.profile")
         places.append(Place(unit, bundle, bus))
-        places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
+        try:
+            places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
+        except td.AddressError as e:
+            raise InputError(f"{path}: units.{i}.bus: {e}") from None
     _check_distinct(places, where=str(path))
     driven = [place.bus for place in places if isinstance(place.bus, td.can.BusSettings)]
     return Station(path, text, file, tuple(places), tuple(bus_places(file.buses, driven, text, where=str(path))))

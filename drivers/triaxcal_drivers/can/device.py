@@ -6,7 +6,7 @@ import asyncio
 import queue
 import struct
 import threading
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar, cast
@@ -17,7 +17,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
-from triaxcal_drivers.can.line import BATCH_FRAMES, CanLine, FrameQueue, join, leave
+from triaxcal_drivers.can.line import BATCH_FRAMES, CanLine, FrameQueue, Matching, join, leave
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.errors import (
     BusError,
@@ -150,6 +150,8 @@ class CanDevice:
         self._settings = bus
         self._layouts = layouts
         self._connection: _Connection | None = None
+        self._node_id = bus.node_id or 0  # of one that has none nothing is asked by SDO
+        self._source = bus.source_address if isinstance(bus.source_address, int) else None  # of J1939, once known
         self._dropped = 0
         # By object, as on the wire. They outlive a connection: an answer to a
         # request of the one before may come late.
@@ -167,7 +169,7 @@ class CanDevice:
         """Raises BusError, DeviceAbsent."""
         await self.close()
         line = await join(self._settings)
-        sdo = PatientSdo(self._settings.node_id, line.clock, self._answers)
+        sdo = PatientSdo(self._node_id, line.clock, self._answers)
         sdo.network = cast(canopen.Network, _Sender(line))
         self._connection = _Connection(line, FrameQueue(line.clock), sdo)
         started = False
@@ -199,7 +201,7 @@ class CanDevice:
 
     @property
     def _boot_up(self) -> int:
-        return _HEARTBEAT + self._settings.node_id
+        return _HEARTBEAT + self._node_id
 
     def _on_heartbeat(self, frame: Frame) -> None:
         """Take a heartbeat. Runs in the receive thread."""
@@ -215,9 +217,9 @@ class CanDevice:
         A node that was stopped answers no SDO, one that is still booting misses
         the command: it is sent before and after the check.
         """
-        await self.send(0, bytes([_NMT_START, self._settings.node_id]))
+        await self.send(0, bytes([_NMT_START, self._node_id]))
         await self._identify()
-        await self.send(0, bytes([_NMT_START, self._settings.node_id]))
+        await self.send(0, bytes([_NMT_START, self._node_id]))
 
     async def _identify(self) -> None:
         identity = self._profile.identity
@@ -282,12 +284,24 @@ class CanDevice:
                 self._booted = None
                 connection.line.unhear(frames)
 
-    def _identifiers(self, names: Sequence[str]) -> set[Identifier]:
+    def _identifiers(self, names: Sequence[str]) -> Collection[Identifier]:
         for name in names:
             if name not in self._layouts:
                 raise ProfileError(f"profile {self._profile.name}: no stream '{name}'{nearest(name, self._layouts)}")
-        node = self._settings.node_id
-        return {(m.identifier_of(node), m.extended) for name in names for m in self._layouts[name].messages}
+        messages = [m for name in names for m in self._layouts[name].messages]
+        fixed = {(m.identifier_of(self._node_id), m.extended) for m in messages if not m.j1939}
+        groups = {m.group for m in messages if m.j1939}
+        return Matching(lambda i: i in fixed or self._is_own(i, groups)) if groups else fixed
+
+    def _is_own(self, identifier: Identifier, groups: Collection[tuple[int, int]]) -> bool:
+        """Whether a frame is of one of the parameter groups and of this unit, which is
+        the first that is heard where nobody says which. Runs in the receive thread."""
+        number, extended = identifier
+        if not extended or all(number & bits != group for bits, group in groups):
+            return False
+        if self._source is None:
+            self._source = number & 0xFF
+        return self._source == number & 0xFF
 
     async def read(self, register: str) -> bytes:
         """Least significant byte first. Raises RegisterRefused, DeviceSilent,

@@ -216,8 +216,9 @@ class _Beside:
 class CanDecoder:
     """Decodes one stream of one unit.
 
-    **Node.** Where identifiers shift with the node, the unit is the one whose
-    message comes first; those of other nodes are passed over.
+    **Node.** Where identifiers shift with the node, or hold a source address
+    (J1939), the unit is the one whose message comes first; those of others are
+    passed over.
 
     **Counter.** It is unwrapped against the record before, by the shorter way
     round. Two kinds of jump are taken for a restart of the device: backwards by
@@ -383,13 +384,18 @@ class CanDecoder:
         node = np.zeros(len(batch), dtype=np.int64)
         for number, message in enumerate(self._layout.messages):
             above = key - message.identifier - message.extended * EXTENDED_KEY
-            match = (above >= 1) & (above <= NODES) if message.per_node else above == 0
+            if message.j1939:
+                bits, group = message.group
+                match = (key >= EXTENDED_KEY) & (key & bits == group)
+                above = key & 0xFF
+            else:
+                match = (above >= 1) & (above <= NODES) if message.per_node else above == 0
             if message.selected:
                 match &= _selected(message, batch, match & usable)
             found[match & usable] = number
             node[match] = above[match]
         shifting = found >= 0
-        shifting &= np.array([m.per_node for m in self._layout.messages])[found]
+        shifting &= np.array([m.per_node or m.j1939 for m in self._layout.messages])[found]
         if self._node is None and shifting.any():
             self._node = int(node[np.argmax(shifting)])
         found[shifting & (node != self._node)] = -1
@@ -607,6 +613,7 @@ class CanDriver:
         from triaxcal_drivers.can.device import CanDevice  # python-can and canopen, which no recording needs
 
         profile = cast(CanProfile, bundle.profile)
+        profile.require_address(bus)
         return CanDevice(profile, bus, {name: _layout(bundle, name) for name in profile.streams})
 
     def loads(self, bundle: Bundle, bus: CanBus) -> Mapping[str, LineLoad]:
@@ -620,7 +627,7 @@ class CanDriver:
             layout = _layout(bundle, name)
             bits = []
             for number, message in enumerate(layout.messages[: layout.sample]):
-                key = message.identifier_of(bus.node_id), message.extended
+                key = message.identifier_of(bus.node_id or 0), message.extended
                 if key not in counted:
                     bits.append(8 * layout.size(number) + (EXTENDED_BITS if message.extended else STANDARD_BITS))
                 counted.add(key)

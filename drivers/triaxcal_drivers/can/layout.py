@@ -36,6 +36,7 @@ NODES = 127
 SHORTEST_COUNTER = 4
 SHORTEST_STAMP = 8  # bits; a shorter one wraps within a few samples
 FRAME_MOST = 64  # bytes of a CAN FD frame
+FIRST_BROADCAST = 240  # PDU format from which on a group has no destination (SAE J1939-21)
 STANDARD_MOST = 0x7FF  # the highest identifier of 11 bits
 _IDENTIFIER = re.compile("0[xX]([0-9A-Fa-f]{1,8})([xX]?)")
 _FLOATS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
@@ -140,8 +141,9 @@ def _implied(signal: Signal, selected: Sequence[Selection]) -> bool:
 @dataclass(frozen=True)
 class Message:
     """A CAN message, or those of its frames that are ``selected``. Where it is
-    ``per_node``, a unit at node N sends it as ``identifier`` + N. ``length`` in
-    bytes, 0 where it is not known; one of J1939 may be longer than a frame."""
+    ``per_node``, a unit at node N sends it as ``identifier`` + N; one of ``j1939``
+    has its priority, its source and its destination in the identifier too.
+    ``length`` in bytes, 0 where it is not known."""
 
     name: str
     identifier: int
@@ -150,12 +152,22 @@ class Message:
     per_node: bool = False
     length: int = 0
     selected: tuple[Selection, ...] = ()
+    j1939: bool = False
+
+    @property
+    def group(self) -> tuple[int, int]:
+        """The bits of an identifier that say the parameter group (SAE J1939-21), and
+        what they are here: without a destination, which some groups have in it."""
+        bits = 0x3FFFF00 if self.identifier >> 16 & 0xFF >= FIRST_BROADCAST else 0x3FF0000
+        return bits, self.identifier & bits
 
     @property
     def title(self) -> str:
         return f"{self.name} ({', '.join(map(str, self.selected))})" if self.selected else self.name
 
     def identifier_of(self, node_id: int) -> int:
+        if self.j1939:
+            return self.identifier & ~0xFF | node_id
         return self.identifier + node_id if self.per_node else self.identifier
 
 
@@ -732,7 +744,16 @@ def stream_layout(stream: CanStream, files: Mapping[str, bytes], *, where: str) 
     """The layout of a stream in the file it names. Raises ProfileError."""
     node_id = stream.base_node_id if isinstance(stream, DbcStream) else None
     messages = _messages(files[stream.file], isinstance(stream, DbcStream), node_id, stream.file)
-    return arrange(messages, stream, where=f"{stream.file} ({where})")
+    layout = arrange(messages, stream, where=f"{stream.file} ({where})")
+    if isinstance(stream, DbcStream) and stream.j1939:
+        for message in layout.messages:
+            if not message.extended:
+                raise ProfileError(
+                    f"{stream.file} ({where}): message '{clipped(message.name)}' has an identifier of 11 bits, and "
+                    "those of J1939 have 29"
+                )
+        return replace(layout, messages=tuple(replace(m, j1939=True) for m in layout.messages))
+    return layout
 
 
 @lru_cache(maxsize=4)

@@ -19,7 +19,7 @@ from collections.abc import AsyncGenerator, Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 from triaxcal_drivers.can.adapter import Adapter, ErrorClass, Frame, Identifier, error_frame
@@ -98,6 +98,20 @@ class _Every(frozenset[Identifier]):
         return True
 
 
+class Matching(frozenset[Identifier]):
+    """Identifiers that a rule takes, too many to list."""
+
+    def __new__(cls, rule: Callable[[Identifier], bool]) -> Matching:
+        made = super().__new__(cls)
+        made._rule = rule
+        return made
+
+    _rule: Callable[[Identifier], bool]
+
+    def __contains__(self, identifier: object) -> bool:
+        return self._rule(cast(Identifier, identifier))
+
+
 class FrameQueue:
     """Takes the frames of the given identifiers, and error frames, while a
     stream is open.
@@ -123,8 +137,8 @@ class FrameQueue:
 
     @property
     def identifiers(self) -> frozenset[Identifier] | None:
-        """None for all."""
-        if isinstance(self._identifiers, _Every):
+        """None for all, or for more than an adapter can be asked for."""
+        if isinstance(self._identifiers, _Every | Matching):
             return None
         return self._identifiers or frozenset()
 
@@ -134,7 +148,11 @@ class FrameQueue:
             self._frames.clear()
             self._loss, self._failure, self._last_ns = None, None, None
             self._flows = self._at_loss = False
-            self._identifiers = opened = _Every() if identifiers is None else frozenset(identifiers)
+            if identifiers is None or isinstance(identifiers, Matching):
+                opened: frozenset[Identifier] = _Every() if identifiers is None else identifiers
+            else:
+                opened = frozenset(identifiers)
+            self._identifiers = opened
         self._some.clear()
         self._enough.clear()
         return opened

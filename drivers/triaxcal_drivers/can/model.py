@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers.claim import Claim, canonical_port
-from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.errors import AddressError, ProfileError
 from triaxcal_drivers.profile import (
     CHANNELS_MOST,
     READING_CHANNELS,
@@ -66,12 +66,12 @@ def bus_name(interface: str, channel: str | int, options: Mapping[str, object]) 
     return ", ".join([f"{interface} {name}", *words])
 
 
-def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapping[str, object]) -> Claim:
-    """A node is one process's, its bus is not, unless the adapter is behind a
+def claim_on_can(interface: str, channel: str | int, device: str, options: Mapping[str, object]) -> Claim:
+    """``device`` is one process's. Its bus is not, unless the adapter is behind a
     serial port."""
     port = _serial_port(str(channel)) if interface in _SERIAL else None
     host = str(options["host"]) if interface == "socketcand" and "host" in options else None
-    return Claim(f"node {node_id} on {bus_name(interface, channel, options)}", host=host, serial_port=port)
+    return Claim(f"{device} on {bus_name(interface, channel, options)}", host=host, serial_port=port)
 
 
 def claim_to_listen(interface: str, channel: str | int, options: Mapping[str, object]) -> Claim | None:
@@ -93,6 +93,7 @@ def _address(text: str) -> str:
         return text
 
 
+NODES_MOST, SOURCES_MOST = 127, 253  # nodes of CANopen, source addresses of J1939
 VALUES_MOST = 256  # of a signal that says what is valid; such a signal has a byte at most
 
 ObjectName = Annotated[
@@ -260,6 +261,10 @@ class DbcStream(_Stream):
     base_node_id: Annotated[
         int | None, Field(ge=1, le=127, description="node of the DBC's identifiers; at another node they shift")
     ] = None
+    j1939: Annotated[
+        bool,
+        Field(description="messages are told by their PGN, at any priority; the unit's bus has a source_address"),
+    ] = False
     valid: Annotated[
         tuple[DbcValidity, ...],
         _several("signal", DbcValidity),
@@ -273,6 +278,12 @@ class DbcStream(_Stream):
     channels: Annotated[
         Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]], Field(max_length=CHANNELS_MOST)
     ]
+
+    @model_validator(mode="after")
+    def _one_address(self) -> Self:
+        if self.j1939 and self.base_node_id is not None:
+            raise ValueError("base_node_id does not go with j1939, where a unit has a source_address")
+        return self
 
     def wanted(self) -> dict[str, Wanted]:
         """Each channel."""
@@ -359,6 +370,27 @@ class CanProfile(Profile):
                     f"every {period_s:g} s; leave it out"
                 )
         return self
+
+    @property
+    def j1939(self) -> bool:
+        return any(isinstance(s, DbcStream) and s.j1939 for s in self.streams.values())
+
+    @property
+    def has_node(self) -> bool:
+        """Whether a unit needs a node: for CANopen, or for identifiers that shift."""
+        shifts = any(isinstance(s, DbcStream) and s.base_node_id is not None for s in self.streams.values())
+        return self.canopen or shifts
+
+    def require_address(self, bus: CanBus) -> None:
+        """Raises AddressError where the bus of a unit lacks its address, or has one of
+        another kind."""
+        if self.has_node and bus.node_id is None:
+            raise AddressError(f"node_id: missing; {self.name} needs it, 1 to {NODES_MOST}")
+        if self.j1939 and bus.source_address is None:
+            first = '"first" for the first that is heard'
+            raise AddressError(f"source_address: missing; {self.name} needs it, 0 to {SOURCES_MOST} or {first}")
+        if bus.source_address is not None and not self.j1939:
+            raise AddressError(f"source_address: no stream of {self.name} is of J1939; leave it out")
 
     @property
     def canopen(self) -> bool:
@@ -454,12 +486,26 @@ class BusSettings(Strict):
 
 
 class CanBus(BusSettings):
-    """Where a unit is: a bus, and its node there."""
+    """Where a unit is: a bus, and its node or its source address there."""
 
-    node_id: Annotated[int, Field(ge=1, le=127)]
+    node_id: Annotated[
+        int | None, Field(ge=1, le=127, description="of a CANopen unit, or where identifiers shift with the node")
+    ] = None
+    source_address: Annotated[
+        Annotated[int, Field(ge=0, le=253)] | Literal["first"] | None,
+        Field(description='of a unit of J1939; "first": the first that is heard is kept'),
+    ] = None
+
+    @property
+    def device(self) -> str:
+        if self.node_id is not None:
+            return f"node {self.node_id}"
+        if self.source_address is not None:
+            return "the first source address" if self.source_address == "first" else f"source {self.source_address}"
+        return "the device"
 
     def __str__(self) -> str:
-        return f"node {self.node_id} on {self.interface} {self.channel}"
+        return f"{self.device} on {self.interface} {self.channel}"
 
     def claim(self) -> Claim:
-        return claim_on_can(self.interface, self.channel, self.node_id, self.options)
+        return claim_on_can(self.interface, self.channel, self.device, self.options)
