@@ -235,7 +235,7 @@ def test_a_can_interface_that_is_not_there(workshop: Any, triaxcal: Run, bus: di
 @pytest.mark.slow
 def test_a_recording_of_so_many_seconds(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
-    with workshop.serve(workshop.device()) as served:
+    with workshop.serve(workshop.device(speed=5.0)) as served:  # so that the end comes in time
         station = workshop.station({"bus": served.bus})
         done = triaxcal("record", station, "-o", rec, "--seconds", "10")
         assert done.code == 0

@@ -333,10 +333,10 @@ def test_what_a_recording_loses_between_bus_and_disk_is_in_its_summary(workshop:
     with workshop.serve(workshop.device(**QUICK)) as served:
         done = triaxcal("record", workshop.station({"bus": served.bus}), "-o", path, "--seconds", "40")
     assert done.code == 0
-    (lost,) = re.findall(r", (\d+) records lost between bus and disk$", done.err.splitlines()[-1])
+    (lost,) = re.findall(r", (\d+) records? lost between bus and disk$", done.err, re.MULTILINE)
     with Recording.open(path) as recording:
         assert int(lost) == sum(loss.records for loss in recording.losses()) > 0
     for command in ("fit", "diagnose"):
-        line = f"missing_samples: {lost} records were lost between bus and disk"
-        assert line in triaxcal(command, path, "--json").json["data_quality"]
+        (line,) = [w for w in triaxcal(command, path, "--json").json["data_quality"] if "between bus and disk" in w]
+        assert line.startswith(f"missing_samples: {lost} record")
         assert f"warning: {line}" in triaxcal(command, path).err.splitlines()
