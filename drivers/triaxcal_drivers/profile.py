@@ -238,7 +238,7 @@ def _is_of_form(role: str | None) -> bool:
 
 
 def _gaps(roles: Collection[str | None]) -> Iterator[str]:
-    """Of each group of roles that a device has all or none of, those that are missing."""
+    """What is missing of each group of roles that a device has all or none of."""
     for group in CORRECTION_GROUPS:
         missing = [role for role in group if role not in roles]
         if missing and len(missing) < len(group):

@@ -680,6 +680,26 @@ def _devices(commands: Any) -> None:
         "drivers, profiles and effects found, broken ones with their reason",
     )  # fmt: skip
     add_json(p)
+    parts = p.add_subparsers(dest="part", metavar="[check]")
+    p = _command(
+        parts, "check", "profiles:check_command", "show what resolves of a profile, and what a log holds by it",
+        "LOG is one that log import takes, or a recording of a unit. Exit 1 if there are problems.",
+        "devices check imu.toml drive.blf",
+    )  # fmt: skip
+    p.add_argument("profile", metavar="PROFILE", type=Path)
+    p.add_argument("log", metavar="LOG", type=Path, nargs="?")
+    _add_selection(p)
+    add_json(p)
+
+
+def _add_selection(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--channel", metavar="NAME",
+        help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
+    )  # fmt: skip
+    p.add_argument(
+        "--node", type=count, metavar="N", help="the unit's, where identifiers shift with it and several nodes send"
+    )
 
 
 def _add_power_cycle(p: argparse.ArgumentParser) -> None:
@@ -785,11 +805,5 @@ def _audits(commands: Any) -> None:
     p.add_argument("log", metavar="LOG", type=Path)
     p.add_argument("--profile", metavar="P", type=Path, required=True, help="of the device whose frames are in it")
     p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
-    p.add_argument(
-        "--channel", metavar="NAME",
-        help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
-    )  # fmt: skip
-    p.add_argument(
-        "--node", type=count, metavar="N", help="the unit's, where identifiers shift with it and several nodes send"
-    )
+    _add_selection(p)
     add_json(p)
