@@ -21,7 +21,15 @@ if TYPE_CHECKING:
         toml_text,
         two_senders,
     )
-    from triaxcal_drivers.catalogue import BUILT_IN, driver_named, listed, load_bundle, parse_bundle
+    from triaxcal_drivers.catalogue import (
+        BUILT_IN,
+        ListedProfile,
+        driver_named,
+        listed,
+        listed_profiles,
+        load_bundle,
+        parse_bundle,
+    )
     from triaxcal_drivers.claim import Claim, canonical_host, claim_of, is_name
     from triaxcal_drivers.errors import (
         BusError,
@@ -80,8 +88,10 @@ _ROOMS = (
 _NAMES = {
     "catalogue": (
         "BUILT_IN",
+        "ListedProfile",
         "driver_named",
         "listed",
+        "listed_profiles",
         "load_bundle",
         "parse_bundle",
     ),
@@ -152,6 +162,7 @@ __all__ = [
     "DriverMissing",
     "Gap",
     "LineLoad",
+    "ListedProfile",
     "LogError",
     "PollStep",
     "Profile",
@@ -177,6 +188,7 @@ __all__ = [
     "host_clock",
     "is_name",
     "listed",
+    "listed_profiles",
     "load_bundle",
     "logs",
     "mcap",

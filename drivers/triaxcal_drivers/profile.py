@@ -255,6 +255,7 @@ class Profile(Strict):
     format: Annotated[Literal["triaxcal.profile/1"], Field(description="always this text")]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", description="lower case, digits, ., _ and -")]
     title: Annotated[str, Field(description="for people")] = ""
+    source: Annotated[str, Field(description="for people: document and page that it was made from")] = ""
     driver: Annotated[str, Field(description="can, modbus, mcap (files alone), or an installed driver")]
     identity: Identity
     output: Output

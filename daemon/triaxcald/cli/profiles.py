@@ -28,6 +28,8 @@ def check_command(a: argparse.Namespace) -> int:
 
 def _show(found: ProfileCheck) -> None:
     show(f"{found.profile} (driver {found.driver}{''.join(f', {name}' for name in found.files)}): {found.title or '—'}")
+    if found.source:
+        show(f"source: {found.source}")
     for stream in found.streams:
         messages = "".join(f", {m.name} {m.identifier}" for m in stream.messages)
         show(f"streams.{stream.name}: {stream.place}{messages}")

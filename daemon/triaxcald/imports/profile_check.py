@@ -59,6 +59,7 @@ def check(bundle: td.Bundle, log: Path | None, *, node: int | None, channel: str
         format="triaxcal.profile_check/1",
         profile=profile.name,
         title=profile.title,
+        source=profile.source,
         driver=profile.driver,
         files=sorted(bundle.files),
         streams=streams,

@@ -146,6 +146,7 @@ class ProfileCheck(tc.schema.Model):
     format: Annotated[Literal["triaxcal.profile_check/1"], Field(description="format of this document")]
     profile: Annotated[tc.schema.Text, Field(description="name of the profile")]
     title: Annotated[tc.schema.Text, Field(description="title of the profile")]
+    source: Annotated[tc.schema.Text, Field(description="document and page that it was made from; may be empty")]
     driver: Annotated[str, Field(description="driver of the profile")]
     files: Annotated[list[tc.schema.Text], Field(description="files that belong to it")]
     streams: Annotated[list[StreamOf], Field(description="streams")]
