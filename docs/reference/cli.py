@@ -88,6 +88,7 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "registers": """Document `triaxcal.registers/1`.""",
     "devices": """Document `triaxcal.devices/1`.""",
     "devices check": """Shows streams with their places in the files, registers, roles, sequences, and the range and resolution of each calibration register as what it makes of 1 g. Of LOG: frames by identifier and kind with the streams that use them, samples, rate, channels that are constant, and |u| in the still poses over the nominal output per g (about 1). LOG may also be a recording of a unit. Exit 0 without [problems](profile-check.md#problems), 1 with any, 2 if profile or log cannot be read. Document [`triaxcal.profile_check/1`](profile-check.md).""",  # noqa: E501
+    "devices new": """On standard output. Each value to replace is marked; optional keys are comments. The profile is sound as it is, beside the DBC or EDS that it names. [How](../how-to/describe-a-device.md#the-profile).""",  # noqa: E501
     "people add": """The roles are `reader`, `operator` and `engineer`; each may do what those before it may. The PIN has 4 to 64 characters, and only its argon2 hash is stored. It is asked twice at the terminal, or is the only line of `--pin-file`. Every change of people and tokens is a row of the trail, and counts at once in a service that runs.""",  # noqa: E501
     "people list": """By name, with the role and whether the person is disabled.""",
     "people pin": """Ends all sessions of the person. An unknown name is an error (exit 2), here and below.""",

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         listed,
         listed_profiles,
         load_bundle,
+        new_profile,
         parse_bundle,
     )
     from triaxcal_drivers.claim import Claim, canonical_host, claim_of, is_name
@@ -93,6 +94,7 @@ _NAMES = {
         "listed",
         "listed_profiles",
         "load_bundle",
+        "new_profile",
         "parse_bundle",
     ),
     "claim": (
@@ -193,6 +195,7 @@ __all__ = [
     "logs",
     "mcap",
     "modbus",
+    "new_profile",
     "parse_bundle",
     "registers",
     "roles",

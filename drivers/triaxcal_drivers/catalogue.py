@@ -74,6 +74,12 @@ BUILT_IN = Path(__file__).parent / "profiles"
 `PROFILES`, which names a package with TOML files, or the path of their folder."""
 
 
+def new_profile(kind: str) -> str:
+    """A commented profile to begin with: ``can-dbc``, ``can-pdo``, ``modbus-poll`` or
+    ``modbus-fifo``."""
+    return (BUILT_IN / "new" / f"{kind}.toml").read_text("utf-8")
+
+
 @dataclass(frozen=True)
 class ListedProfile:
     """An installed profile, by the ``name`` that a station gives; ``fault`` says why

@@ -1,4 +1,4 @@
-"""devices check."""
+"""devices check, devices new."""
 
 from __future__ import annotations
 
@@ -24,6 +24,12 @@ def check_command(a: argparse.Namespace) -> int:
     for problem in found.problems:
         say(f"problem: {problem.text}")
     return 1 if found.problems else 0
+
+
+def new_command(a: argparse.Namespace) -> int:
+    for line in td.new_profile(a.kind).splitlines():
+        show(line)
+    return 0
 
 
 def _show(found: ProfileCheck) -> None:

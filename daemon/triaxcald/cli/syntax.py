@@ -680,7 +680,7 @@ def _devices(commands: Any) -> None:
         "drivers, profiles and effects found, broken ones with their reason",
     )  # fmt: skip
     add_json(p)
-    parts = p.add_subparsers(dest="part", metavar="[check]")
+    parts = p.add_subparsers(dest="part", metavar="[check|new]")
     p = _command(
         parts, "check", "profiles:check_command", "show what resolves of a profile, and what a log holds by it",
         "LOG is one that log import takes, or a recording of a unit. Exit 1 if there are problems.",
@@ -690,6 +690,14 @@ def _devices(commands: Any) -> None:
     p.add_argument("log", metavar="LOG", type=Path, nargs="?")
     _add_selection(p)
     add_json(p)
+    p = _command(
+        parts, "new", "profiles:new_command", "print a commented profile to begin with",
+        "", "devices new can-dbc > my-device.toml",
+    )  # fmt: skip
+    p.add_argument("kind", choices=NEW_PROFILES, metavar="|".join(NEW_PROFILES), help="bus and layout of the samples")
+
+
+NEW_PROFILES = ("can-dbc", "can-pdo", "modbus-poll", "modbus-fifo")
 
 
 def _add_selection(p: argparse.ArgumentParser) -> None:
