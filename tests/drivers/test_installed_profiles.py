@@ -123,3 +123,32 @@ def test_broken_packages_are_listed_and_break_no_others(tmp_path: Path, triaxcal
     absent = triaxcal_beside("devices", "check", "acme-x3")
     assert (absent.returncode, absent.stderr.count("\n")) == (2, 1)
     assert "acme-x1" in absent.stderr
+
+
+DRIVER = """
+from pydantic import BaseModel
+from triaxcal_drivers.profile import Profile
+
+class SerialDriver:
+    profile_model = Profile
+    bus_model = BaseModel
+"""
+SERIAL = """
+format = "triaxcal.profile/1"
+name = "their-unit"
+driver = "their-serial"
+identity = { vendor = "they", product = "unit" }
+output = { unit = "counts" }
+sampling = { rate_hz = 10.0 }
+streams = { readings = { column = 3, channels = { ux = 0, uy = { at = 1 }, uz = 2 } } }
+"""
+
+
+def test_a_package_may_bring_a_driver_and_its_profiles(tmp_path: Path, triaxcal_beside: Listing) -> None:
+    package(tmp_path, "theirs", {"their-unit.toml": SERIAL}, module=DRIVER)
+    entries = tmp_path / "theirs-1.0.dist-info" / "entry_points.txt"
+    entries.write_text(entries.read_text() + "[triaxcal.drivers]\ntheir-serial = theirs:SerialDriver\n")
+    assert rows_of(triaxcal_beside("devices", "--json"))["theirs", "their-unit"]["driver"] == "their-serial"
+    done = triaxcal_beside("devices", "check", "their-unit", "--json")
+    (stream,) = json.loads(done.stdout)["streams"]
+    assert (stream["place"], [c["place"] for c in stream["channels"]]) == ("column 3", ["0", "at 1", "2"])

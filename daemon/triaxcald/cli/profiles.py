@@ -6,7 +6,7 @@ import argparse
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.cli.console import emit, say, show, table
+from triaxcald.cli.console import emit, show, table
 from triaxcald.imports.profile_check import check
 from triaxcald.schema.profile_check import CalibrationOf, LogOf, ProfileCheck
 
@@ -21,8 +21,6 @@ def check_command(a: argparse.Namespace) -> int:
         emit(found.document())
     else:
         _show(found)
-    for problem in found.problems:
-        say(f"problem: {problem.text}")
     return 1 if found.problems else 0
 
 
@@ -54,6 +52,8 @@ def _show(found: ProfileCheck) -> None:
         _show_log(found.log)
     for note in found.notes:
         show(f"note: {note}")
+    for problem in found.problems:
+        show(f"problem: {problem.text}")
     if not found.problems:
         show("no problem found")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from triaxcald.imports.of_can import identifiers_shown, is_own, layouts_of
 from triaxcald.imports.of_can import work_on as work_on_frames
 from triaxcald.imports.of_mcap import work_on as work_on_messages
 from triaxcald.imports.opening import DRIVERS, opened_log
+from triaxcald.inputs import PROFILE
 from triaxcald.provision.registers import role_ranges
 from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.bus import is_of_bus
@@ -93,7 +95,8 @@ def _streams(bundle: td.Bundle) -> list[StreamOf]:
             channels = [ChannelOf(name=c, place=_signal(layouts[name], c)) for c in layouts[name].channels]
             messages = [MessageOf(name=m.name, identifier=_identifier(m)) for m in layouts[name].messages]
         else:
-            channels = [ChannelOf(name=c, place=_in_words(given)) for c, given in stream.channels.items()]
+            given = _keys(stream).get("channels")
+            channels = [ChannelOf(name=c, place=_in_words(of)) for c, of in given.items()] if given else []
             messages = []
         found.append(StreamOf(name=name, place=_in_words(stream), messages=messages, channels=channels))
     return found
@@ -113,11 +116,24 @@ def _identifier(message: td.can.Message) -> str:
     return identifiers_shown([key]) + (" + node" if message.per_node else "")
 
 
+def _keys(described: Any) -> Mapping[str, Any]:
+    """Of a part of a profile, which a driver of another package may leave a dict."""
+    if isinstance(described, Mapping):
+        return described
+    found: dict[str, Any] = described.model_dump(exclude_unset=True, exclude_none=True)
+    return found
+
+
 def _in_words(described: Any) -> str:
     """The keys of a part of a profile with their values, but for the parts of it
     that have names."""
-    given = described.model_dump(exclude_unset=True, exclude_none=True, exclude={"channels", "unit", "description"})
+    if not hasattr(described, "model_dump") and not isinstance(described, Mapping):
+        return str(described)
+    given = {key: value for key, value in _keys(described).items() if key not in _NAMED}
     return ", ".join(f"{key} {_value(key, value)}" for key, value in given.items())
+
+
+_NAMED = ("channels", "unit", "description")
 
 
 def _value(key: str, value: Any) -> str:
@@ -328,8 +344,10 @@ class _Stream:
         columns = {f"u{axis}": block.readings[:, i] for i, axis in enumerate(td.roles.AXES)}
         for name, values in {**columns, **block.channels}.items():
             least, most = self._values.get(name, (np.inf, -np.inf))
-            with np.errstate(invalid="ignore"):
-                self._values[name] = float(np.fmin(least, values.min())), float(np.fmax(most, values.max()))
+            self._values[name] = (
+                float(np.fmin(least, np.fmin.reduce(values))),
+                float(np.fmax(most, np.fmax.reduce(values))),
+            )
 
     @property
     def _lost(self) -> dict[str, int]:
@@ -595,8 +613,13 @@ class _UnitRecording:
     def __init__(self, bundle: td.Bundle, recording: Contents) -> None:
         self.bundle, self._recording, self.account = bundle, recording, td.logs.Account()
         self.streams, self._rows = tuple(bundle.profile.streams), _Rows()
-        self._can = bundle.profile.driver == "can"
-        self._selection = work_on_frames(bundle, node=None, channel=None).selection if self._can else None
+        self._driver = bundle.profile.driver
+        made_with = _driver_of(recording)
+        if made_with not in (None, self._driver):
+            raise InputError(
+                f"{recording.name}: of a unit of driver '{made_with}', and the profile's driver is '{self._driver}'"
+            )
+        self._selection = work_on_frames(bundle, node=None, channel=None).selection if self._driver == "can" else None
 
     def batches(self) -> Iterator[td.RawBatch]:
         for batch in self._recording.raw(CALIBRATION):
@@ -609,10 +632,13 @@ class _UnitRecording:
         if self._selection is not None:
             return self._selection.streams_of(source, flags)
         streams: Mapping[str, Any] = self.bundle.profile.streams
+        if self._driver != "modbus":
+            return self.streams  # whose records nobody here knows
+        function, address = source >> 16, source & 0xFFFF
         return [
             name
             for name, stream in streams.items()
-            if (getattr(stream, "function", None), getattr(stream, "address", None)) == (source >> 16, source & 0xFFFF)
+            if function == stream.function and stream.address <= address < stream.address + stream.words
         ]
 
     def settle(self) -> None:
@@ -621,14 +647,24 @@ class _UnitRecording:
 
     def frames(self) -> Iterator[FrameOf]:
         for (source, flags, _), row in self._rows.of.items():
-            streams = self.streams_of(source, flags)
-            if self._can:
-                named = identifiers_shown([(source, flags & td.RawFlag.EXTENDED_ID)])
-                yield _frame(named, _kind_of(flags), "", row, streams, None)
-            else:
-                table = "input" if source >> 16 == INPUT else "holding"
-                kind = "error" if flags & td.RawFlag.ERROR else "reply"
-                yield _frame(f"{table} 0x{source & 0xFFFF:04X}", kind, "", row, streams, None)
+            kind = _kind_of(flags) if self._driver == "can" else "error" if flags & td.RawFlag.ERROR else "reply"
+            yield _frame(self._named(source, flags), kind, "", row, self.streams_of(source, flags), None)
+
+    def _named(self, source: int, flags: int) -> str:
+        if self._driver == "can":
+            return identifiers_shown([(source, flags & td.RawFlag.EXTENDED_ID)])
+        if self._driver == "modbus":
+            return f"{'input' if source >> 16 == INPUT else 'holding'} 0x{source & 0xFFFF:04X}"
+        return str(source)
+
+
+def _driver_of(recording: Contents) -> str | None:
+    """Of the profile that it was made with; None where that cannot be told."""
+    try:
+        found = tomllib.loads(recording.attachments[PROFILE].decode()).get("driver")
+    except (KeyError, ValueError):
+        return None
+    return found if isinstance(found, str) else None
 
 
 INPUT = 4

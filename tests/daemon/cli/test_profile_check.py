@@ -158,11 +158,12 @@ def test_what_does_not_fit_is_a_problem(
 ) -> None:
     words = ("devices", "check", imu(*changes), log("a.log"))
     done = triaxcal(*words, "--json")
-    assert (done.code, codes(done.json)) == (1, wanted)
-    assert [line for line in done.err.splitlines() if line.startswith("problem: ")] == [
+    assert (done.code, done.err, codes(done.json)) == (1, "", wanted)
+    shown = triaxcal(*words)
+    assert shown.code == 1
+    assert [line for line in shown.out.splitlines() if line.startswith("problem: ")] == [
         f"problem: {problem['text']}" for problem in done.json["problems"]
     ]
-    assert triaxcal(*words).code == 1
 
 
 def test_several_nodes_are_a_problem_until_one_is_named(triaxcal: Run, imu: Any, log: Any, tmp_path: Path) -> None:
@@ -303,3 +304,6 @@ def test_bad_input_is_one_line(triaxcal: Run, imu: Any, log: Any, tmp_path: Path
     triaxcal("devices", "check", imu(), imu()).failed(2, "no log of a known kind")
     triaxcal("devices", "check", "triax-ref-modbus", path).failed(2, "driver 'modbus' has no other logs")
     triaxcal("devices", "check", "none").failed(2, "built-in profiles")
+    recording = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
+    triaxcal("devices", "check", "triax-ref-modbus", recording).failed(2, "driver 'can'", "driver is 'modbus'")
+    triaxcal("devices", "check", "triax-ref-can", recording, "--node", 5).failed(2, "neither --node nor --channel")
