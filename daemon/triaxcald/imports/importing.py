@@ -256,7 +256,7 @@ def file_told(path: Path) -> dict[str, Any]:
 
 # Messages about an import, in English.
 
-REMARKS = {
+_REMARKS = {
     "no_times": "the log tells no times: samples are laid at the profile's rate, from zero",
     "no_date": "the log has no date: times count from its start",
     "date_without_zone": "the log's date names no time zone, and is taken for UTC",
@@ -315,7 +315,7 @@ def _off(detail: Mapping[str, Any], seconds: float) -> str:
 def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
     """What a reader of the recording ought to know, a line each; ``seconds``
     are those that the samples cover."""
-    lines = [REMARKS[name] for name in detail["remarks"]]
+    lines = [_REMARKS[name] for name in detail["remarks"]]
     times = detail["times"]
     if times["back"]:
         lines.append(

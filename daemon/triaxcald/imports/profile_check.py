@@ -14,7 +14,7 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.certificate import why_not_written
 from triaxcald.errors import InputError
-from triaxcald.imports.importing import RATE_OFF, REMARKS, Record, Times, in_batches
+from triaxcald.imports.importing import RATE_OFF, Record, Times, in_batches, remarks
 from triaxcald.imports.of_can import identifiers_shown, is_own, layouts_of
 from triaxcald.imports.of_can import work_on as work_on_frames
 from triaxcald.imports.of_mcap import work_on as work_on_messages
@@ -304,9 +304,14 @@ def _looked_at(path: Path, source: _Source, found: _Found) -> LogOf:
     for stream in streams.values():
         stream.judge(found)
     account = source.account
-    if account.damaged:
-        found.notes.append(f"damaged: {tc.number_format.number_of(account.damaged, 'place')}, {account.damage}")
-    found.notes += [REMARKS[name] for name in sorted(account.remarks)]
+    detail = {
+        "remarks": sorted(account.remarks),
+        "times": Times(1.0).document(),  # of each stream the problems tell
+        "seconds_by_log": None,
+        "damaged": account.damaged,
+        "damage": account.damage,
+    }
+    found.notes += remarks(detail, 0.0)
     return LogOf(
         file=str(path),
         kind=source.kind,
