@@ -28,6 +28,7 @@ EDS_MOST, LINES_MOST = 2**20, 30_000
 """Bytes and lines; a drive of three thousand objects comes near. canopen takes
 a second for so many."""
 MAPPED_MOST = 64  # objects in a PDO (CiA 301)
+COMPACT_MOST = 5000  # members that compact storage stands for; 512 PDOs of eight bytes map 4096
 _COMMENT = re.compile(r"(?:^|\s)[;#].*")
 _BLANKS = re.compile(r"\s+")
 _SECTION = re.compile(r"\[([^\]]+)\]$")
@@ -172,9 +173,11 @@ def _objects(sections: Mapping[str, _Keys], where: str) -> dict[int, _Object]:
             members[subindex] = keys
         else:
             objects.setdefault(index, _Object()).keys = keys
-    for index in _PDOS:
-        if index in objects:
-            _expand(objects[index], values.get(index, {}))
+    pdos = [index for index in _PDOS if index in objects]
+    if sum(min(objects[index].count("CompactSubObj"), MAPPED_MOST) for index in pdos) > COMPACT_MOST:
+        raise ProfileError(f"{where}: not an EDS file: CompactSubObj of PDOs: more than {COMPACT_MOST} in all")
+    for index in pdos:
+        _expand(objects[index], values.get(index, {}))
     return objects
 
 

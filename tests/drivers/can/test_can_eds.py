@@ -133,6 +133,10 @@ def test_a_dcf_for_one_node_keeps_its_identifier() -> None:
         ("ParameterName=a\n" + PLAIN, ["line 1: expected [section]"]),
         (PLAIN + "[1A01Name]\nNrOfEntries=4000000000\n", ["NrOfEntries=4000000000"]),
         (PLAIN + " " * EDS_MOST, ["larger than"]),
+        (
+            HEAD + "".join(f"[{i:04X}]\nObjectType=8\nCompactSubObj=64\nDataType=7\n" for i in range(0x1A00, 0x1B00)),
+            ["CompactSubObj", "more than 5000"],
+        ),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(text: str, said: list[str]) -> None:
