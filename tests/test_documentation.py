@@ -254,8 +254,8 @@ def subcommands(top: argparse.ArgumentParser, prefix: str = "") -> dict[str, arg
     for action in top._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, sub in action.choices.items():
-                inner = subcommands(sub, f"{prefix}{name} ")
-                found |= inner or {f"{prefix}{name}": sub}
+                found |= {f"{prefix}{name}": sub} if sub.get_default("run") else {}
+                found |= subcommands(sub, f"{prefix}{name} ")
     return found
 
 

@@ -87,6 +87,8 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "restore": """The source is a recording (`registers-before.json`) or a journal; its registers go only to the unit with their serial number. Document `triaxcal.restoration/1` with `device_state`, `evidence`, `registers`, `error`, `outcome` and `outcome_file`.""",  # noqa: E501
     "registers": """Document `triaxcal.registers/1`.""",
     "devices": """Document `triaxcal.devices/1`.""",
+    "devices check": """Shows streams with their places in the files, registers, roles, sequences, and the range and resolution of each calibration register as what it makes of 1 g. Of LOG: frames by identifier and kind with the streams that use them, samples, rate, channels that are constant, and |u| in the still poses over the nominal output per g (about 1). LOG may also be a recording of a unit. Exit 0 without [problems](profile-check.md#problems), 1 with any, 2 if profile or log cannot be read. Document [`triaxcal.profile_check/1`](profile-check.md).""",  # noqa: E501
+    "devices new": """On standard output. Each value to replace is marked; optional keys are comments. The profile is sound as it is, beside the DBC or EDS that it names. [How](../how-to/describe-a-device.md#the-profile).""",  # noqa: E501
     "people add": """The roles are `reader`, `operator` and `engineer`; each may do what those before it may. The PIN has 4 to 64 characters, and only its argon2 hash is stored. It is asked twice at the terminal, or is the only line of `--pin-file`. Every change of people and tokens is a row of the trail, and counts at once in a service that runs.""",  # noqa: E501
     "people list": """By name, with the role and whether the person is disabled.""",
     "people pin": """Ends all sessions of the person. An unknown name is an error (exit 2), here and below.""",
@@ -137,8 +139,9 @@ def commands_of(top: argparse.ArgumentParser, prefix: str = "") -> Iterator[tupl
     for action in top._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, p in action.choices.items():
-                inner = list(commands_of(p, f"{prefix}{name} "))
-                yield from inner or [(f"{prefix}{name}", p)]
+                if p.get_default("run"):  # one with parts may be a command itself
+                    yield f"{prefix}{name}", p
+                yield from commands_of(p, f"{prefix}{name} ")
 
 
 def options(p: argparse.ArgumentParser) -> list[argparse.Action]:

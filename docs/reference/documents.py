@@ -21,6 +21,7 @@ from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Stage, Verdict
 from triaxcald.schema.event import KINDS, Event, Head
 from triaxcald.schema.outcome import Outcome
+from triaxcald.schema.profile_check import Fault, ProfileCheck
 from triaxcald.schema.quality import Chart, Quality
 from triaxcald.schema.result import Result
 from triaxcald.schema.results import Results
@@ -46,6 +47,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "quality": Quality,
     "chart": Chart,
     "result": Result,
+    "profile-check": ProfileCheck,
 }
 JSON_TYPES = {
     "string": "text",
@@ -185,6 +187,13 @@ The [service](../how-to/run-a-station.md#results-for-other-systems) sends `triax
 Made from the model in `daemon/triaxcald/schema/result.py` by `docs/reference/documents.py`; [JSON Schema](result.schema.json).
 
 """  # noqa: E501
+PROFILE_CHECK = """# Check of a profile
+
+`triaxcal devices check PROFILE [LOG] --json` prints `triaxcal.profile_check/1` ([how to use it](../how-to/describe-a-device.md#try-it)).
+
+Made from the model in `daemon/triaxcald/schema/profile_check.py` by `docs/reference/documents.py`; [JSON Schema](profile-check.schema.json).
+
+"""  # noqa: E501
 JOURNAL = """
 ## Journal
 
@@ -208,6 +217,7 @@ def pages() -> dict[Path, str]:
         "station-state": STATION_STATE + _keys(StationState) + "\n## State of a slot\n\n" + _words("state", SlotIs),
         "quality": QUALITY + _keys(Quality) + CHART + _keys(Chart),
         "result": RESULT + _keys(Result),
+        "profile-check": PROFILE_CHECK + _keys(ProfileCheck) + "\n## Problems\n\n" + _words("code", Fault),
     }
     return made | {HERE / f"{name}.md": text for name, text in texts.items()}
 

@@ -21,7 +21,16 @@ if TYPE_CHECKING:
         toml_text,
         two_senders,
     )
-    from triaxcal_drivers.catalogue import BUILT_IN, driver_named, listed, load_bundle, parse_bundle
+    from triaxcal_drivers.catalogue import (
+        BUILT_IN,
+        ListedProfile,
+        driver_named,
+        listed,
+        listed_profiles,
+        load_bundle,
+        new_profile,
+        parse_bundle,
+    )
     from triaxcal_drivers.claim import Claim, canonical_host, claim_of, is_name
     from triaxcal_drivers.errors import (
         AddressError,
@@ -57,6 +66,7 @@ if TYPE_CHECKING:
         PollStep,
         Profile,
         ReconnectStep,
+        Register,
         SendStep,
         Step,
         Strict,
@@ -81,9 +91,12 @@ _ROOMS = (
 _NAMES = {
     "catalogue": (
         "BUILT_IN",
+        "ListedProfile",
         "driver_named",
         "listed",
+        "listed_profiles",
         "load_bundle",
+        "new_profile",
         "parse_bundle",
     ),
     "claim": (
@@ -125,6 +138,7 @@ _NAMES = {
         "Profile",
         "READINGS",
         "ReconnectStep",
+        "Register",
         "SCALE_FACTOR_RATIO",
         "SendStep",
         "Step",
@@ -155,6 +169,7 @@ __all__ = [
     "DriverMissing",
     "Gap",
     "LineLoad",
+    "ListedProfile",
     "LogError",
     "PollStep",
     "Profile",
@@ -162,6 +177,7 @@ __all__ = [
     "RawBatch",
     "RawFlag",
     "ReconnectStep",
+    "Register",
     "RegisterRefused",
     "RegisterValueError",
     "SampleBlock",
@@ -180,10 +196,12 @@ __all__ = [
     "host_clock",
     "is_name",
     "listed",
+    "listed_profiles",
     "load_bundle",
     "logs",
     "mcap",
     "modbus",
+    "new_profile",
     "parse_bundle",
     "registers",
     "roles",

@@ -1,15 +1,16 @@
-"""The drivers that are installed, found by entry point, none imported until asked
-for; and from the text of a profile to a `Bundle`: the driver that it names
-validates it, and its files are read."""
+"""The drivers and profiles that are installed, found by entry point, none imported
+until asked for; and from the text of a profile to a `Bundle`: the driver that it
+names validates it, and its files are read."""
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from triaxcal_drivers.errors import DriverMissing, ProfileError
 from triaxcal_drivers.files import inside, read_whole, size
@@ -20,7 +21,8 @@ from triaxcal_drivers.toml_text import PROFILE, parse_toml, read_toml, validate
 if TYPE_CHECKING:
     from triaxcal_drivers.interface import Driver
 
-GROUP = "triaxcal.drivers"
+GROUP, PROFILES = "triaxcal.drivers", "triaxcal.profiles"
+OURS = "triaxcal"
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,69 @@ def listed() -> list[Listed]:
 
 
 BUILT_IN = Path(__file__).parent / "profiles"
+"""Ours. Profiles of other packages are found by an entry point of the group
+`PROFILES`, which names a package with TOML files, or the path of their folder."""
+
+
+def new_profile(kind: str) -> str:
+    """A commented profile to begin with: ``can-dbc``, ``can-pdo``, ``modbus-poll`` or
+    ``modbus-fifo``."""
+    return (BUILT_IN / "new" / f"{kind}.toml").read_text("utf-8")
+
+
+@dataclass(frozen=True)
+class ListedProfile:
+    """An installed profile, by the ``name`` that a station gives; ``fault`` says why
+    it cannot be found, where it cannot, and ``path`` is None then."""
+
+    name: str
+    path: Path | None
+    distribution: str
+    fault: str | None = None
+
+
+def listed_profiles() -> list[ListedProfile]:
+    """Every installed profile: ours, and those of other packages, which are imported
+    for it. None of them is read."""
+    found = [ListedProfile(path.stem, path, OURS) for path in sorted(BUILT_IN.glob("*.toml"))]
+    holders = {one.name: one.distribution for one in found}
+    for point in sorted(entry_points(group=PROFILES), key=lambda p: (p.name, p.value)):
+        package = (point.dist.name if point.dist else None) or "?"
+        try:
+            paths = _paths(point)
+        except ProfileError as e:
+            found.append(ListedProfile(point.name, None, package, str(e)))
+            continue
+        for path in paths:
+            why = f"{holders[path.stem]} has a profile of that name: give {path}" if path.stem in holders else None
+            holders.setdefault(path.stem, package)
+            found.append(ListedProfile(path.stem, None if why else path, package, why))
+    return found
+
+
+def _paths(point: EntryPoint) -> list[Path]:
+    """The profiles of an entry point. Raises ProfileError with the reason, whatever
+    the other package does when it is imported."""
+    try:
+        paths = [path for folder in _folders(point.load()) for path in sorted(folder.glob("*.toml"))]
+    except (Exception, SystemExit) as e:
+        raise ProfileError(f"{point.value} cannot be loaded: {e!r}") from e
+    if not paths:
+        raise ProfileError(f"{point.value}: there is no profile (*.toml) in it")
+    return paths
+
+
+def _folders(named: Any) -> list[Path]:
+    """Of a package, or the folder itself. Raises OSError, TypeError."""
+    if getattr(named, "__path__", None) is None and hasattr(named, "__file__"):
+        raise TypeError("a module: expected a package, or the path of a folder")  # whose folder has files of others
+    folders = [Path(place) for place in getattr(named, "__path__", None) or [os.fspath(named)]]
+    for folder in folders:
+        if not folder.is_dir():
+            raise NotADirectoryError(f"{folder} is no folder")
+    return folders
+
+
 FILE_MOST = 16 * 2**20
 """Bytes of a DBC or EDS file; the DBC of a whole vehicle, comments and all, has
 some ten million."""
@@ -108,20 +173,34 @@ def _held(file: str, files: Mapping[str, bytes] | None, folder: Path | None, whe
     return data
 
 
+def _installed(name: str) -> Path | None:
+    """The file of an installed profile; other packages are imported for it where none
+    of ours has that name. None without one."""
+    path = BUILT_IN / f"{name}.toml"
+    return path if os.path.exists(path) else next((p.path for p in listed_profiles() if p.name == name), None)
+
+
+def _absent(path: Path) -> ProfileError:
+    """Names the installed profiles, and why one of that name is not to be had."""
+    profiles = listed_profiles()
+    ours = ", ".join(p.name for p in profiles if p.distribution == OURS)
+    others = ", ".join(p.name for p in profiles if p.distribution != OURS and p.path is not None)
+    broken = "".join(f"; {p.distribution}: {p.fault}" for p in profiles if p.name == path.stem and p.fault)
+    more = f"; of other packages: {others}" if others else ""
+    return ProfileError(f"{path}: {os.strerror(errno.ENOENT)}; built-in profiles: {ours}{more}{broken}")
+
+
 def load_bundle(path: Path) -> Bundle:
-    """The profile at ``path``, or a built-in one where ``path`` is a bare name
+    """The profile at ``path``, or an installed one where ``path`` is a bare name
     such as ``triax-ref-can``."""
     if "\0" in str(path):
         raise ProfileError(f"{str(path)!r}: no file has such a name")
     if not os.path.exists(path) and path.suffix in ("", ".toml") and path.parent == Path():
-        built_in = BUILT_IN / (path.stem + ".toml")
-        if os.path.exists(built_in):
-            path = built_in
+        path = _installed(path.stem) or path
     try:
         text = read_toml(path, expected=PROFILE)
     except FileNotFoundError as e:
-        known = sorted(p.stem for p in BUILT_IN.glob("*.toml"))
-        raise ProfileError(f"{path}: {e.strerror}; built-in profiles: {', '.join(known)}") from e
+        raise _absent(path) from e
     except OSError as e:
         raise ProfileError(f"{path}: {e.strerror}") from e
     return parse_bundle(text, None, where=str(path), folder=path.parent)

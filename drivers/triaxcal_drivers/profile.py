@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -300,6 +300,15 @@ def _is_of_form(role: str | None) -> bool:
     return role is not None and role.partition(".")[0] in CORRECTION
 
 
+def _gaps(roles: Collection[str | None]) -> Iterator[str]:
+    """What is missing of each group of roles that a device has all or none of."""
+    for group in CORRECTION_GROUPS:
+        missing = [role for role in group if role not in roles]
+        if missing and len(missing) < len(group):
+            there = ", ".join(role for role in group if role in roles)
+            yield f"roles {there} without {', '.join(missing)}: [correction] takes a register for each axis"
+
+
 class Profile(Strict):
     """The part of a profile that every device has."""
 
@@ -311,6 +320,7 @@ class Profile(Strict):
     format: Annotated[Literal["triaxcal.profile/1"], Field(description="always this text")]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", description="lower case, digits, ., _ and -")]
     title: Annotated[str, Field(description="for people")] = ""
+    source: Annotated[str, Field(description="for people: document and page that it was made from")] = ""
     driver: Annotated[str, Field(description="can, modbus, mcap (files alone), or an installed driver")]
     identity: Identity
     output: Output
@@ -363,7 +373,8 @@ class Profile(Strict):
                 raise ValueError(f"registers.{name}: no role '{role}'{nearest(role, CORRECTION_ROLES)}")
         if of_form and form is None:
             role, name = next(iter(of_form.items()))
-            raise ValueError(f"registers.{name}: the role {role} needs [correction] form = {_FORMS}")
+            gaps = "".join(f"; {gap}" for gap in _gaps(of_form))
+            raise ValueError(f"registers.{name}: the role {role} needs [correction] form = {_FORMS}{gaps}")
         if form is None:
             return
         if not of_form:
@@ -375,13 +386,8 @@ class Profile(Strict):
                     f"registers.{name}: the role {r.role} does not go with {other} (registers.{theirs}): a device "
                     f'corrects either by form = "{form}" or by the model of scale factor, misalignment and bias'
                 )
-        for group in CORRECTION_GROUPS:
-            missing = [role for role in group if role not in of_form]
-            if missing and len(missing) < len(group):
-                raise ValueError(
-                    f"registers: roles {', '.join(r for r in group if r in of_form)} without {', '.join(missing)}: "
-                    "expected a register for each axis"
-                )
+        for gap in _gaps(of_form):
+            raise ValueError(f"registers: {gap}")
         if any(role.endswith((".t1", ".t2")) for role in of_form) and self.by_role(REFERENCE_ROLE) is None:
             raise ValueError(f"registers: roles with .t1 or .t2 need one with the role {REFERENCE_ROLE}")
         self._require_sound_outputs()

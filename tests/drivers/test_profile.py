@@ -143,6 +143,29 @@ def test_names_that_do_not_resolve_are_named_with_the_nearest(old, new, message)
     assert message in said
 
 
+FORM = '[correction]\nform = "matrix"\n[registers]'
+
+
+@pytest.mark.parametrize(
+    ("roles", "head", "missing"),
+    [
+        (["matrix.xx"], "[registers]", ["matrix.yy", "matrix.zz"]),
+        (["matrix.xx", "matrix.zz"], FORM, ["matrix.yy"]),
+        (["matrix.yx"], "[registers]", ["matrix.zx", "matrix.zy"]),
+        (["offset.y"], "[registers]", ["offset.x", "offset.z"]),
+        (["offset.x", "offset.y", "offset.z", "offset.z.t1"], FORM, ["offset.x.t1", "offset.y.t1"]),
+    ],
+)
+def test_a_correction_without_all_axes_names_those_that_are_missing(roles, head, missing):
+    registers = "".join(f'r{i} = {{ address = {20 + 2 * i}, type = "float32", role = "{r}" }}\n'
+                        for i, r in enumerate(roles))  # fmt: skip
+    linear = GOOD[GOOD.index("bias_x = {") : GOOD.index("[sequences]")]
+    text = GOOD[: GOOD.index("[sequences]")].replace(linear, registers).replace("[registers]", head)
+    said = fault(text)
+    assert "[correction]" in said
+    assert f"without {', '.join(missing)}:" in said
+
+
 def test_an_unknown_driver_is_named():
     with pytest.raises(DriverMissing, match=r"^unit\.toml: no driver named 'modbas'; did you mean 'modbus'\?$"):
         parse_bundle(GOOD.replace('"modbus"', '"modbas"').encode(), {}, where="unit.toml")

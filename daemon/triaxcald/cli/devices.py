@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import triaxcal as tc
@@ -76,26 +75,31 @@ async def _registers(place: Place) -> tuple[str | None, list[Any]]:
 
 def devices_command(a: argparse.Namespace) -> int:
     drivers = [dataclasses.asdict(d) for d in td.listed()]
-    profiles = [_profile(path) for path in sorted(td.BUILT_IN.glob("*.toml"))]
+    profiles = [_profile(listed) for listed in td.listed_profiles()]
     effects = _effects()
     if a.json:
         emit({"format": "triaxcal.devices/1", "drivers": drivers, "profiles": profiles, "effects": effects})
         return 0
     rows = [[d["name"], d["distribution"], d["target"], d["fault"] or "usable"] for d in drivers]
     table("drivers", ["name", "package", "class", "state"], rows)
-    table("profiles", ["name", "title", "state"], [[p["name"], p["title"], p["fault"] or "usable"] for p in profiles])
+    shown = [[p["name"], p["title"], p["distribution"], p["source"], p["fault"] or "usable"] for p in profiles]
+    table("profiles", ["name", "title", "package", "source", "state"], shown)
     table("effects", ["name", "from", "state"], [[e["name"], e["origin"], e["fault"] or "usable"] for e in effects])
     for broken in (x for x in (*drivers, *profiles, *effects) if x["fault"]):
         say(f"warning: {broken['name']}: {broken['fault']}")
     return 0
 
 
-def _profile(path: Path) -> dict[str, Any]:
+def _profile(listed: td.ListedProfile) -> dict[str, Any]:
+    row = {"name": listed.name, "title": "", "driver": "", "fault": listed.fault,
+           "distribution": listed.distribution, "source": ""}  # fmt: skip
+    if listed.path is None:
+        return row
     try:
-        profile = td.load_bundle(path).profile
+        profile = td.load_bundle(listed.path).profile
     except (td.ProfileError, td.DriverMissing, td.DriverError) as e:
-        return {"name": path.stem, "title": "", "driver": "", "fault": str(e)}
-    return {"name": profile.name, "title": profile.title, "driver": profile.driver, "fault": None}
+        return {**row, "fault": str(e)}
+    return {**row, "title": profile.title, "driver": profile.driver, "source": profile.source}
 
 
 def _effects() -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import dataclasses
 import io
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,7 +21,7 @@ from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file, require_new, require_recording
 from triaxcald.imports.importing import left_out, remarks, summary
-from triaxcald.imports.of_can import is_own, own_log
+from triaxcald.imports.opening import DRIVERS, opened_log
 from triaxcald.inputs import bundle_of, losses_of, samples_of
 from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Contents, open_recording
@@ -155,16 +155,11 @@ def import_command(a: argparse.Namespace) -> int:
     require_recording(a.output)
     bundle = td.load_bundle(a.profile)
     driver = bundle.profile.driver
-    if driver not in ("can", "mcap"):
+    if driver not in DRIVERS:
         raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
     if driver == "mcap" and a.node is not None:
         raise InputError("--node: of a CAN bus; the profile's driver is 'mcap'")
-    own = driver == "can" and is_own(a.log)
-    with nullcontext(own_log(a.log)) if own else td.logs.opened(a.log) as log:
-        if isinstance(log.kind, td.logs.Kind) != (driver == "can"):
-            name = log.kind.name if isinstance(log.kind, td.logs.Kind) else log.kind
-            held = "frames of CAN" if driver == "can" else "messages"
-            raise InputError(f"{a.log}: {name}, which holds no {held}; the profile's driver is '{driver}'")
+    with opened_log(a.log, driver) as log:
         if driver == "can":
             from triaxcald.imports.of_can import import_can  # each with what it needs alone
 

@@ -681,6 +681,35 @@ def _devices(commands: Any) -> None:
         "drivers, profiles and effects found, broken ones with their reason",
     )  # fmt: skip
     add_json(p)
+    parts = p.add_subparsers(dest="part", metavar="[check|new]")
+    p = _command(
+        parts, "check", "profiles:check_command", "show what resolves of a profile, and what a log holds by it",
+        "LOG is one that log import takes, or a recording of a unit. Exit 1 if there are problems.",
+        "devices check imu.toml drive.blf",
+    )  # fmt: skip
+    p.add_argument("profile", metavar="PROFILE", type=Path)
+    p.add_argument("log", metavar="LOG", type=Path, nargs="?")
+    _add_selection(p)
+    add_json(p)
+    p = _command(
+        parts, "new", "profiles:new_command", "print a commented profile to begin with",
+        "", "devices new can-dbc > my-device.toml",
+    )  # fmt: skip
+    p.add_argument("kind", choices=NEW_PROFILES, metavar="|".join(NEW_PROFILES), help="bus and layout of the samples")
+
+
+NEW_PROFILES = ("can-dbc", "can-pdo", "modbus-poll", "modbus-fifo")
+
+
+def _add_selection(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--channel", metavar="NAME",
+        help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
+    )  # fmt: skip
+    p.add_argument(
+        "--node", type=whole, metavar="N",
+        help="the unit's node, where identifiers shift with it, or its source address (J1939), where several send",
+    )  # fmt: skip
 
 
 def _add_power_cycle(p: argparse.ArgumentParser) -> None:
@@ -786,14 +815,5 @@ def _audits(commands: Any) -> None:
     p.add_argument("log", metavar="LOG", type=Path)
     p.add_argument("--profile", metavar="P", type=Path, required=True, help="of the device whose frames are in it")
     p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
-    p.add_argument(
-        "--channel", metavar="NAME",
-        help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
-    )  # fmt: skip
-    p.add_argument(
-        "--node",
-        type=whole,
-        metavar="N",
-        help="the unit's node, where identifiers shift with it, or its source address (J1939), where several send",
-    )
+    _add_selection(p)
     add_json(p)

@@ -41,6 +41,7 @@ class Times:
     equal: int = 0  # those whose time is that of the one before
     pauses: int = 0
     longest_pause_ns: int = 0
+    paused_ns: int = 0  # all pauses together
 
     def note(self, time_ns: int) -> None:
         if self.first_ns is None:
@@ -56,6 +57,7 @@ class Times:
         elif self.is_pause(step_ns):
             self.pauses += 1
             self.longest_pause_ns = max(self.longest_pause_ns, step_ns)
+            self.paused_ns += step_ns
         self.latest_ns = time_ns
 
     def is_pause(self, step_ns: int) -> bool:
@@ -65,6 +67,12 @@ class Times:
     def seconds(self) -> float:
         """From the first to the latest."""
         return 0.0 if self.first_ns is None else (self.latest_ns - self.first_ns) / 1e9
+
+    def rate_hz(self, count: int) -> float | None:
+        """Of so many samples in that time, without the pauses; None where that
+        cannot be told."""
+        steps, busy_s = count - 1 - self.pauses, self.seconds - self.paused_ns / 1e9
+        return steps / busy_s if steps > 0 and busy_s > 0 else None
 
     def document(self) -> dict[str, float | int]:
         return {
@@ -257,7 +265,7 @@ _REMARKS = {
     "two_senders": "two units send on the readings' stream, and their samples are mixed: they are no good for a fit",
     "stamp_stands_still": "the messages' own time stamp stands still: times are those at which they were logged",
 }
-_RATE_OFF = 1.1
+RATE_OFF = 1.1
 """Samples by the counter last so many times as long as the log, or so many times
 less: oscillators are off by a hundredth at most."""
 _COUNTS = {
@@ -296,7 +304,7 @@ def left_out(detail: Mapping[str, Any]) -> str:
 def _off(detail: Mapping[str, Any], seconds: float) -> str:
     """Where the samples' own time is not the log's; empty where it is."""
     by_log = detail["seconds_by_log"]
-    if not by_log or "no_times" in detail["remarks"] or by_log / _RATE_OFF < seconds < by_log * _RATE_OFF:
+    if not by_log or "no_times" in detail["remarks"] or by_log / RATE_OFF < seconds < by_log * RATE_OFF:
         return ""
     return (
         f"the samples last {seconds:.2f} s by their own time, which is their counter at the profile's"

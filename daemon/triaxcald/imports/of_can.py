@@ -57,11 +57,15 @@ class Selection:
 
     def __post_init__(self) -> None:
         self._nodes: dict[Key, int | None] = {}  # by identifier; None where it does not shift
-        self._groups = {m.group for layout in self.layouts.values() for m in layout.messages if m.j1939}
+        self._groups = [(m.group, name) for name, of in self.layouts.items() for m in of.messages if m.j1939]
         for layout in self.layouts.values():
             for message in layout.messages:
                 self._nodes |= _identifiers(message)
-        self._readings = {key for m in self.layouts[td.READINGS].messages for key in _identifiers(m)}
+        self._streams: dict[Key, list[str]] = {}
+        for name, layout in self.layouts.items():
+            for key in dict.fromkeys(key for m in layout.messages for key in _identifiers(m)):
+                self._streams.setdefault(key, []).append(name)
+        self._readings = {key for key, names in self._streams.items() if td.READINGS in names}
         counted = (m for layout in self.layouts.values() if layout.counters for m in layout.messages)
         self._counted = {key for m in counted for key in _identifiers(m)}
         self._seen: Counter[tuple[Key, str]] = Counter()
@@ -101,16 +105,19 @@ class Selection:
         """Note the identifier where it is of a parameter group of J1939: its source
         address is the node."""
         source, extended = key
-        if extended and any(source & bits == group for bits, group in self._groups):
-            self._nodes[key] = source & 0xFF
-            for keys, counted in ((self._readings, False), (self._counted, True)):
-                if any(source & bits == group for bits, group in self._groups_of(counted=counted)):
-                    keys.add(key)
+        names = [name for (bits, group), name in self._groups if extended and source & bits == group]
+        if not names:
+            return
+        self._nodes[key] = source & 0xFF
+        self._streams[key] = names
+        if td.READINGS in names:
+            self._readings.add(key)
+        if any(self.layouts[name].counters for name in names):
+            self._counted.add(key)
 
-    def _groups_of(self, *, counted: bool) -> set[tuple[int, int]]:
-        """Of the readings, or of all streams with a counter."""
-        layouts = self.layouts.values() if counted else [self.layouts[td.READINGS]]
-        return {m.group for layout in layouts if layout.counters or not counted for m in layout.messages if m.j1939}
+    def streams_of(self, source: int, flags: int) -> list[str]:
+        """The streams that use a frame."""
+        return [] if flags & _ERROR else self._streams.get((source, flags & _EXTENDED), [])
 
     def is_reading(self, frame: td.logs.LoggedFrame) -> bool:
         """Whether it is one of the messages that make a sample of the
@@ -140,7 +147,7 @@ class Selection:
             self.node = next(iter(nodes))
         self._require_one_channel(name)
         if not self.taken:
-            known = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER)
+            known = identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER)
             elsewhere = f"frames of other channels or nodes, or in error ({self.elsewhere})" if self.elsewhere else ""
             there = ", ".join(filter(None, (known, elsewhere))) or "no frame"
             wanted = ", ".join(self._wanted()[:SHOWN])
@@ -153,7 +160,7 @@ class Selection:
             places.setdefault(key, Counter())[channel] += count
         for key, found in places.items():
             if len(found) > 1:
-                shown = _identifiers_shown([key])
+                shown = identifiers_shown([key])
                 raise InputError(f"{name}: {shown} comes on {_listed(found)}; --channel says which is the unit's")
 
     def _wanted(self) -> list[str]:
@@ -162,7 +169,7 @@ class Selection:
             key = message.identifier_of(self.node or 0), _EXTENDED if message.extended else 0
             shifts = message.per_node and self.node is None
             any_source = message.j1939 and self.node is None
-            shown.append(_identifiers_shown([key]) + (" + node" if shifts else " of any source" if any_source else ""))
+            shown.append(identifiers_shown([key]) + (" + node" if shifts else " of any source" if any_source else ""))
         return list(dict.fromkeys(shown))
 
     @property
@@ -180,7 +187,7 @@ def _identifiers(message: td.can.Message) -> dict[Key, int | None]:
     return {(message.identifier + node, flag): node for node in range(1, td.can.NODES + 1)}
 
 
-def _identifiers_shown(keys: Iterable[Key]) -> str:
+def identifiers_shown(keys: Iterable[Key]) -> str:
     shown = [f"0x{source:X}{'x' if extended else ''}" for source, extended in keys]
     return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
 
@@ -194,14 +201,7 @@ def _listed(counted: Mapping[Any, int]) -> str:
 
 def import_can(log: td.logs.Log, bundle: td.Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:
     """Raises InputError, RecordingError, LogError, ProfileError."""
-    profile = cast(td.can.CanProfile, bundle.profile)
-    assert isinstance(log.kind, td.logs.Kind)
-    layouts = {
-        name: td.can.stream_layout(stream, bundle.files, where=f"profile {profile.name}, streams.{name}")
-        for name, stream in profile.streams.items()
-    }
-    period_ns = 1e9 / profile.sampling.rate_hz
-    work = _Work(Selection(layouts, node, channel), td.logs.Account(), Times(period_ns), Ticks(period_ns))
+    work = work_on(bundle, node=node, channel=channel)
 
     def describe(importing: Importing) -> dict[str, Any]:
         return work.described(log, importing)
@@ -213,11 +213,27 @@ def import_can(log: td.logs.Log, bundle: td.Bundle, out: Path, *, node: int | No
 _LOST_BEFORE = int(td.RawFlag.LOST_BEFORE)
 
 
-class _Work:
-    """What is counted on the way."""
+def layouts_of(bundle: td.Bundle) -> dict[str, td.can.Layout]:
+    """Of each stream of a profile on CAN. Raises ProfileError."""
+    profile = cast(td.can.CanProfile, bundle.profile)
+    return {
+        name: td.can.stream_layout(stream, bundle.files, where=f"profile {profile.name}, streams.{name}")
+        for name, stream in profile.streams.items()
+    }
+
+
+def work_on(bundle: td.Bundle, *, node: int | None, channel: str | None) -> Work:
+    """For one log. Raises ProfileError."""
+    period_ns = 1e9 / bundle.profile.sampling.rate_hz
+    selection = Selection(layouts_of(bundle), node, channel)
+    return Work(selection, td.logs.Account(), Times(period_ns), Ticks(period_ns))
+
+
+class Work:
+    """One log on its way into raw records, and what is counted of it."""
 
     def __init__(self, selection: Selection, account: td.logs.Account, times: Times, ticks: Ticks) -> None:
-        self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
+        self.selection, self.account, self._times, self._ticks = selection, account, times, ticks
         self._readings = Times(times.period_ns)
         self._latest_ns: dict[tuple[int, int], int] = {}  # by identifier
         self._marked_ns = -1  # where a pause was marked last
@@ -227,14 +243,14 @@ class _Work:
         it may have been of the unit's. A pause is such a loss, as counters may
         have wrapped meanwhile."""
         lost: set[str] = set()  # channels
-        for frame in log.frames(self._account):
+        for frame in log.frames(self.account):
             if frame.flags & _LOST_BEFORE:
                 lost.add(frame.channel)
-            if not self._selection.takes(frame):
+            if not self.selection.takes(frame):
                 continue
             time_ns = self._time_ns(frame)
             if not 0 <= time_ns < td.logs.LONGEST_NS:
-                self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
+                self.account.note(f"frame {self.selection.frames}", f"a time of {time_ns} ns")
                 continue
             self._times.note(time_ns)
             paused = self._paused(frame, time_ns)
@@ -245,9 +261,9 @@ class _Work:
     def _paused(self, frame: td.logs.LoggedFrame, time_ns: int) -> bool:
         """Whether this is the first frame of a stream with a counter after a
         pause of that."""
-        if self._selection.is_reading(frame):
+        if self.selection.is_reading(frame):
             self._readings.note(time_ns)
-        if not self._selection.is_counted(frame):
+        if not self.selection.is_counted(frame):
             return False
         key = frame.source, frame.flags & td.logs.EXTENDED
         before_ns, self._latest_ns[key] = self._latest_ns.get(key, time_ns), time_ns
@@ -257,13 +273,13 @@ class _Work:
         return True
 
     def _time_ns(self, frame: td.logs.LoggedFrame) -> int:
-        if td.logs.Remark.NO_TIMES in self._account.remarks:
-            return self._ticks.of((frame.source, frame.flags & td.logs.EXTENDED), self._selection.is_reading(frame))
+        if td.logs.Remark.NO_TIMES in self.account.remarks:
+            return self._ticks.of((frame.source, frame.flags & td.logs.EXTENDED), self.selection.is_reading(frame))
         return -1 if frame.time_ns is None else frame.time_ns
 
     def described(self, log: td.logs.Log, importing: Importing) -> dict[str, Any]:
         """Raises InputError."""
-        chosen, account, counts = self._selection, self._account, importing.counts
+        chosen, account, counts = self.selection, self.account, importing.counts
         try:
             chosen.settle(log.name)
             if not counts["samples"]:

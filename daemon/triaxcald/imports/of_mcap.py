@@ -81,19 +81,24 @@ SHOWN = 12  # topics in a message
 
 def import_mcap(log: td.logs.Log, bundle: td.Bundle, out: Path, *, channel: str | None = None) -> Imported:
     """Raises InputError, RecordingError, LogError, ProfileError."""
-    profile = cast(td.mcap.McapProfile, bundle.profile)
-    only = None if channel is None else _asked_for(log, profile, channel)
-    schemas = _schemas(log, profile, only)
-    files = {td.mcap.schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
-    whole = replace(bundle, files={**bundle.files, **files})
-    work = _Work(profile, log, only)
-    still = any(schema.stamp_stands_still for schema in schemas.values())
+    whole, work, still = work_on(log, bundle, channel=channel)
 
     def describe(importing: Importing) -> dict[str, Any]:
         return work.described(importing, still)
 
     detail, seconds = write_recording(out, whole, work.records(), Path(log.name), describe)
     return Imported(out, detail, seconds)
+
+
+def work_on(log: td.logs.Log, bundle: td.Bundle, *, channel: str | None) -> tuple[td.Bundle, Work, bool]:
+    """For one log: the bundle with the definitions of its messages, the work, and
+    whether the messages' own stamps stand still. Raises InputError, ProfileError."""
+    profile = cast(td.mcap.McapProfile, bundle.profile)
+    only = None if channel is None else _asked_for(log, profile, channel)
+    schemas = _schemas(log, profile, only)
+    files = {td.mcap.schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
+    still = any(schema.stamp_stands_still for schema in schemas.values())
+    return replace(bundle, files={**bundle.files, **files}), Work(profile, log, only), still
 
 
 def _asked_for(log: td.logs.Log, profile: td.mcap.McapProfile, number: str) -> td.mcap.Channel:
@@ -170,28 +175,28 @@ def _stands_still(profile: td.mcap.McapProfile, name: str, schema: td.mcap.Messa
     return len(head) > 1
 
 
-class _Work:
-    """What is counted on the way."""
+class Work:
+    """One log on its way into raw records, and what is counted of it."""
 
     def __init__(self, profile: td.mcap.McapProfile, log: td.logs.Log, only: td.mcap.Channel | None) -> None:
         self._profile, self._log = profile, log
-        self._account = td.logs.Account()
+        self.account = td.logs.Account()
         self._times = Times(1e9 / profile.sampling.rate_hz)
         self._numbers = {stream.topic: i for i, stream in enumerate(profile.streams.values())}
         self._readings = list(profile.streams).index(td.READINGS)
-        self._channels = Channels(self._numbers, only)
+        self.channels = Channels(self._numbers, only)
         self._first: dict[str, td.mcap.Channel] = {}  # by topic
         self._messages = self._taken = self._others = 0
 
     def records(self) -> Iterator[Record]:
         """Raises LogError."""
-        for message in td.mcap.McapFile(self._log.stream, self._account).messages():
+        for message in td.mcap.McapFile(self._log.stream, self.account).messages():
             self._messages += 1
             topic = message.channel.topic
             if topic not in self._numbers:
                 self._others += 1
                 continue
-            if not self._channels.takes(message.channel):
+            if not self.channels.takes(message.channel):
                 continue
             first = self._first.setdefault(topic, message.channel)
             if first.schema != message.channel.schema:
@@ -203,9 +208,9 @@ class _Work:
                 )
             where = f"message {self._messages}"
             if len(message.data) > MESSAGE_MOST:
-                self._account.note(where, f"{len(message.data)} bytes, expected at most {MESSAGE_MOST}")
+                self.account.note(where, f"{len(message.data)} bytes, expected at most {MESSAGE_MOST}")
             elif message.log_time_ns >= td.logs.LONGEST_NS:
-                self._account.note(where, f"a time of {message.log_time_ns} ns")
+                self.account.note(where, f"a time of {message.log_time_ns} ns")
             else:
                 self._taken += 1
                 if self._numbers[topic] == self._readings:
@@ -214,7 +219,7 @@ class _Work:
 
     def described(self, importing: Importing, still: bool) -> dict[str, Any]:
         """Raises InputError."""
-        follow = self._channels.settle(self._log.name)
+        follow = self.channels.settle(self._log.name)
         counts = importing.counts
         if not counts["samples"]:
             why = ", ".join(no_samples(counts)) or "none is of the readings"
@@ -229,11 +234,11 @@ class _Work:
             "frames": self._messages,
             "taken": self._taken,
             "error_frames": 0,
-            "elsewhere": self._channels.elsewhere,
+            "elsewhere": self.channels.elsewhere,
             "other_frames": self._others,
-            "other_records": dict(self._account.others),
-            "damaged": self._account.damaged,
-            "damage": self._account.damage,
+            "other_records": dict(self.account.others),
+            "damaged": self.account.damaged,
+            "damage": self.account.damage,
             "remarks": ["channels_follow"] * follow
             + ["stamp_stands_still"] * still
             + ["two_senders"] * importing.two_senders,

@@ -139,6 +139,79 @@ def checksum_of(profile: td.Profile, raw: Mapping[str, bytes]) -> int:
     return td.registers.crc(profile.crc.algorithm, covered)
 
 
+# What the registers could hold, as what it makes of 1 g. Profile alone, no I/O.
+
+
+@dataclass(frozen=True)
+class RoleRange:
+    """Range and step of a role's register in g: what a value makes of 1 g, of an
+    effect of temperature at 1 K. A gain of 1 is the nominal one. None without a bound,
+    or where the nominal scale factor is not known; ``nominal`` is what a device
+    without a calibration holds."""
+
+    role: str
+    register: str
+    least_g: float | None
+    most_g: float | None
+    resolution_g: float | None
+    per: str
+    nominal_g: float
+
+    @property
+    def holds_nominal(self) -> bool:
+        low = -math.inf if self.least_g is None else self.least_g
+        high = math.inf if self.most_g is None else self.most_g
+        slack = 1e-9 * max(1.0, abs(self.nominal_g))  # a minimum may be the nominal value, which is computed
+        return low - slack <= self.nominal_g <= high + slack
+
+
+def role_ranges(profile: td.Profile) -> list[RoleRange]:
+    """Of every coefficient of a calibration that has a writable register."""
+    return [
+        _range(profile, name)
+        for name in calibration_registers(profile)
+        if profile.registers[name].role not in td.roles.OTHER_ROLES
+    ]
+
+
+def _range(profile: td.Profile, name: str) -> RoleRange:
+    register = profile.registers[name]
+    worth, nominal, per = _worth(profile, register.role or "")
+    type_ = td.registers.TYPES[register.type]
+    low, high = register.minimum, register.maximum
+    if isinstance(type_, td.registers.Integer):  # the bounds of a float do not matter
+        ends = sorted(raw * register.scale + register.offset for raw in (type_.lowest, type_.highest))
+        low = ends[0] if low is None else max(low, ends[0])
+        high = ends[1] if high is None else min(high, ends[1])
+    if worth is None:
+        return RoleRange(register.role, name, None, None, None, per, nominal)
+    found = [None if bound is None else bound * worth for bound in ((low, high) if worth > 0 else (high, low))]
+    step = td.registers.step(register, 1.0 / worth) * abs(worth)
+    return RoleRange(register.role, name, found[0], found[1], step, per, nominal)
+
+
+def _worth(profile: td.Profile, role: str) -> tuple[float | None, float, str]:
+    """What a value of 1 makes of 1 g, None where the nominal scale factor is not
+    known; the nominal value in g; and by what both are divided."""
+    bare = role.removesuffix(".t1").removesuffix(".t2")
+    per = {"t1": "K", "t2": "K²"}.get(role.rpartition(".")[2], "")
+    quantity, of = td.roles.parsed(bare)
+    gain = 1.0 if bare == role else 0.0
+    if quantity == td.roles.SCALE_FACTOR:
+        nominal = profile.output.nominal_scale_factor
+        return (None if nominal is None else 1.0 / nominal[td.roles.AXES.index(of)]), 1.0, per
+    if quantity == td.roles.MATRIX:
+        column = td.roles.AXES.index(of[1])
+        return 1.0 / profile.nominal_diagonal[column], gain if of[0] == of[1] else 0.0, per
+    if quantity == td.roles.OFFSET:
+        after = profile.correction is not None and profile.correction.form == "matrix-after"
+        row = 1.0 if after else abs(profile.nominal_diagonal[td.roles.AXES.index(of)])
+        return row / profile.output_per_g, 0.0, per
+    units = [c.unit for e in tc.effects.CATALOGUE if e.name == quantity for c in e.coefficients if c.name == of]
+    divisor = units[0].partition("/")[2].strip("()") if units else ""
+    return 1.0, 0.0, "" if divisor.startswith("g") else divisor  # g/g² at 1 g is g
+
+
 # What the device holds: its calibration registers as raw bytes.
 
 

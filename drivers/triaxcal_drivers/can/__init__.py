@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING
 from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
-    from triaxcal_drivers.can.layout import NODES, Layout, Message, object_dictionary, stream_layout
+    from triaxcal_drivers.can.eds import object_dictionary
+    from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
     from triaxcal_drivers.can.line import BusListener, opened
     from triaxcal_drivers.can.model import BusSettings, CanBus, CanProfile, object_address
     from triaxcal_drivers.can.python_can import open_python_can
 
 _NAMES = {
+    "eds": ("object_dictionary",),
     "layout": (
         "Layout",
         "Message",
         "NODES",
-        "object_dictionary",
         "stream_layout",
     ),
     "line": (

@@ -1,17 +1,14 @@
 """Layout of a stream's channels in its CAN messages, out of the DBC or EDS file that
 the stream names, and the extraction of channels from many frames at once. No I/O.
 
-No other file reads DBC and EDS files. Of a DBC this one takes what a stream can
-need: messages, their signals, and which of these are floats. It passes over
-comments, value tables and whatever else somebody put there, so that a vehicle's
-DBC takes a fraction of a second and a hostile one no longer.
+Of a DBC it takes what a stream can need: messages, their signals, and which of
+these are floats. It passes over comments, value tables and whatever else somebody
+put there, so that a vehicle's DBC takes a fraction of a second and a hostile one
+no longer.
 """
 
 from __future__ import annotations
 
-import configparser
-import io
-import logging
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,9 +20,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal_drivers.can.eds import object_dictionary, value
 from triaxcal_drivers.can.model import CanStream, DbcStream, Scaling
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.files import size
 from triaxcal_drivers.hints import clipped, nearest
 
 if TYPE_CHECKING:
@@ -143,7 +140,8 @@ class Message:
     """A CAN message, or those of its frames that are ``selected``. Where it is
     ``per_node``, a unit at node N sends it as ``identifier`` + N; one of ``j1939``
     has its priority, its source and its destination in the identifier too.
-    ``length`` in bytes, 0 where it is not known."""
+    ``length`` in bytes, 0 where it is not known. One with a ``fault`` cannot be
+    used: it is disabled, or its file does not say what it holds."""
 
     name: str
     identifier: int
@@ -151,6 +149,7 @@ class Message:
     extended: bool = False
     per_node: bool = False
     length: int = 0
+    fault: str = ""
     selected: tuple[Selection, ...] = ()
     j1939: bool = False
 
@@ -327,7 +326,10 @@ class _Index:
         self._messages, self._node_id = messages, node_id
         self._of: dict[str, list[int]] = {}  # numbers of the messages of that name
         self._with: dict[str, list[int]] = {}  # of those that hold a signal of that name
+        self._unusable = [m for m in messages if m.fault]
         for i, m in enumerate(messages):
+            if m.fault:
+                continue
             self._of.setdefault(m.name, []).append(i)
             for name in m.signals:
                 self._with.setdefault(name, []).append(i)
@@ -340,8 +342,8 @@ class _Index:
         found = [(i, self._messages[i].signals[name]) for i in self._with.get(name, []) if i in inside]
         if not found:
             at = f" in message '{within}'" if within else ""
-            known = (s for i in inside for s in self._messages[i].signals)
-            raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
+            known = (s for i in inside for s in self._messages[i].signals if not self._messages[i].fault)
+            raise ProfileError(f"{where}: no signal '{name}'{at}{self._why(name) or nearest(name, known)}")
         return found
 
     def one_of(
@@ -369,6 +371,12 @@ class _Index:
                 f"{where}: there are several messages '{name}' ({', '.join(map(self.place, found))}); name one of them"
             )
         return found[0]
+
+    def _why(self, name: str) -> str:
+        """The fault of a message that holds the signal, else that of one of
+        which nobody knows what it holds; empty without one."""
+        holding = [m.fault for m in self._unusable if name in m.signals]
+        return "".join(f": {fault}" for fault in (holding or [m.fault for m in self._unusable if not m.signals])[:1])
 
     def _named(self, within: str, where: str) -> Sequence[int]:
         """The messages ``Message`` or ``Message@0x19``."""
@@ -729,15 +737,7 @@ def _check(signal: Signal, message: _Described, where: str) -> None:
         )
 
 
-logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it logs comes back as exceptions too
-
-EDS_MOST, LINES_MOST = 2**20, 30_000
-"""Bytes and lines; a drive of three thousand objects comes near. canopen takes
-a second for so many."""
-_COMMENT = re.compile(r"(?:^|\s)[;#].*")
-_BLANKS = re.compile(r"\s+")
-_ENTRY = re.compile(r"\[[^\]]+\]$|[^=:\[][^=:]*[=:]")
-_EXTENDED, _UNUSED = 1 << 29, 1 << 31  # bits of a PDO's COB-ID (CiA 301)
+_DISABLED, _EXTENDED = 1 << 31, 1 << 29  # bits of a PDO's COB-ID (CiA 301)
 
 
 def stream_layout(stream: CanStream, files: Mapping[str, bytes], *, where: str) -> Layout:
@@ -762,81 +762,49 @@ def _messages(data: bytes, dbc: bool, base_node_id: int | None, where: str) -> l
     units of a station."""
     if dbc:
         return dbc_messages(data, base_node_id=base_node_id, where=where)
-    return pdo_messages(object_dictionary(data, node_id=0, where=where), where=where)
+    return pdo_messages(object_dictionary(data, node_id=0, where=where))
 
 
-def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDictionary:
-    """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises
-    ProfileError; ModuleNotFoundError without canopen."""
-    from canopen.objectdictionary.eds import import_eds  # half a second, and only an EDS needs it
+def pdo_messages(objects: ObjectDictionary) -> list[Message]:
+    """The TPDOs, by their mapping (0x1A00…) and COB-ID (0x1800…); signals are
+    named ``0x2300:01``. One that cannot be used says why in its ``fault``."""
+    found = (_tpdo(objects, number) for number in range(512) if 0x1800 + number in objects)
+    return [message for message in found if message is not None]
 
-    text = _entries(data, where)
+
+def _tpdo(objects: ObjectDictionary, number: int) -> Message | None:
+    """None where it maps nothing and has a fault: nobody misses it then."""
+    name, cob_id, per_node, fault = f"TPDO{number + 1}", 0, False, ""
     try:
-        objects: ObjectDictionary = import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
-    except configparser.MissingSectionHeaderError as e:  # its message shows what is there instead
-        raise ProfileError(f"{where}: not an EDS file: line {e.lineno}: expected [section]") from e
-    except (configparser.Error, ValueError, KeyError, TypeError, AttributeError) as e:
-        raise ProfileError(f"{where}: not an EDS file: {clipped(' '.join(str(e).split()), 200)}") from e
-    return objects
+        cob_id, per_node = value(objects, 0x1800 + number, 1)
+    except ProfileError as e:
+        fault = f"{name}: {e}"
+    if cob_id & _DISABLED:
+        fault = f"{name} is disabled (bit 31 of its COB-ID, 0x{0x1800 + number:04X}:01 = 0x{cob_id:X})"
+    try:
+        signals = _mapped(objects, number)
+    except ProfileError as e:
+        return None if cob_id & _DISABLED else Message(name, 0, {}, fault=str(e))
+    if fault and not signals:
+        return None
+    extended = bool(cob_id & _EXTENDED)
+    identifier = cob_id & (0x1FFFFFFF if extended else STANDARD_MOST)
+    return Message(name, identifier, signals, extended, per_node, fault=fault)
 
 
-def _entries(data: bytes, where: str) -> str:
-    """The file's text without comments, blanks single. Raises ProfileError
-    where a line is none of an EDS.
-
-    Of such lines, and of long runs of blanks, configparser takes their square,
-    and its message shows what they hold.
-    """
-    if len(data) > EDS_MOST:
-        raise ProfileError(f"{where}: larger than the {size(EDS_MOST)} that an EDS file may have")
-    if data.count(b"\n") > LINES_MOST:
-        raise ProfileError(f"{where}: more than the {LINES_MOST} lines that an EDS file may have")
-    lines = []
-    for number, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
-        bare = _BLANKS.sub(" ", _COMMENT.sub("", line)).strip()
-        if bare and not _ENTRY.match(bare):
-            raise ProfileError(f"{where}: not an EDS file: line {number}: expected [section] or key=value")
-        lines.append(bare)
-    return "\n".join(lines)
-
-
-def pdo_messages(objects: ObjectDictionary, *, where: str) -> list[Message]:
-    """The TPDOs in use, by their mapping (0x1A00…) and COB-ID (0x1800…);
-    signals are named ``0x2300:01``."""
-    messages = []
-    for number in range(512):
-        if 0x1800 + number not in objects:
-            continue
-        cob_id = _default(objects, 0x1800 + number, 1, where)
-        if cob_id & _UNUSED:
-            continue
-        extended = bool(cob_id & _EXTENDED)
-        identifier = cob_id & (0x1FFFFFFF if extended else 0x7FF)
-        relative = getattr(objects.get_variable(0x1800 + number, 1), "relative", False)  # it says $NODEID
-        signals = _mapped(objects, number, where)
-        messages.append(Message(f"TPDO{number + 1}", identifier, signals, extended, relative))
-    return messages
-
-
-def _default(objects: ObjectDictionary, index: int, subindex: int, where: str) -> int:
-    variable = objects.get_variable(index, subindex)
-    if variable is None or not isinstance(variable.default, int):
-        raise ProfileError(f"{where}: object 0x{index:04X}:{subindex:02X} has no default value")
-    return variable.default
-
-
-def _mapped(objects: ObjectDictionary, number: int, where: str) -> dict[str, Signal]:
+def _mapped(objects: ObjectDictionary, number: int) -> dict[str, Signal]:
+    """Raises ProfileError without the file's name."""
     signals: dict[str, Signal] = {}
     start = 0
-    for entry in range(1, _default(objects, 0x1A00 + number, 0, where) + 1):
-        word = _default(objects, 0x1A00 + number, entry, where)
+    for entry in range(1, value(objects, 0x1A00 + number, 0)[0] + 1):
+        word, _ = value(objects, 0x1A00 + number, entry)
         index, subindex, length = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if index >= 0x20:  # below are the data types, mapped as a filler
-            signal = _mapped_signal(objects, index, subindex, start, length, f"{where}: TPDO{number + 1}")
+            signal = _mapped_signal(objects, index, subindex, start, length, f"TPDO{number + 1}")
             signals[signal.name] = signal
         start += length
     if start > 64:
-        raise ProfileError(f"{where}: TPDO{number + 1} maps {start} bits, which is more than 64")
+        raise ProfileError(f"TPDO{number + 1} maps {start} bits, which is more than 64")
     return signals
 
 

@@ -303,7 +303,7 @@ class PdoStream(_Stream):
     the mapped objects."""
 
     layout: Annotated[Literal["pdo"], Field(description="pdo: an EDS file maps the messages")]
-    eds: Annotated[str, Field(description="the EDS file, in the profile's folder or below it")]
+    eds: Annotated[str, Field(description="the EDS or DCF file, in the profile's folder or below it")]
     counter: Annotated[ObjectName | None, Field(description="object that all messages of a sample bear")] = None
     valid: Annotated[
         tuple[PdoValidity, ...],

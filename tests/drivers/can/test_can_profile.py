@@ -9,7 +9,8 @@ import pytest
 from canopen.objectdictionary import datatypes
 
 from triaxcal_drivers.can.driver import CanDriver
-from triaxcal_drivers.can.layout import object_dictionary, pdo_messages, stream_layout
+from triaxcal_drivers.can.eds import object_dictionary
+from triaxcal_drivers.can.layout import pdo_messages, stream_layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, PdoStream, object_address
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import ProfileError
@@ -182,7 +183,7 @@ def test_every_register_of_the_profile_is_an_object_of_the_eds(bundle: Bundle, p
 
 def test_the_eds_maps_the_same_messages_as_the_dbc_describes(bundle: Bundle, profiles: Path) -> None:
     objects = object_dictionary((profiles / EDS).read_bytes(), node_id=0, where=EDS)
-    tpdos = pdo_messages(objects, where=EDS)
+    tpdos = pdo_messages(objects)
     assert [(m.name, m.identifier, m.per_node) for m in tpdos] == [
         ("TPDO1", 0x180, True), ("TPDO2", 0x280, True), ("TPDO3", 0x380, True), ("TPDO4", 0x480, True),
     ]  # fmt: skip
