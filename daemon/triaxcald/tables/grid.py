@@ -20,7 +20,8 @@ from triaxcald.tables.native_csv import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, hea
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
-_LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
+_LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*|[-=+_*]{3,}[ \t]*)?(?:\n|\Z)"
+"""Blank lines, remarks and the borders of a printed table."""
 _NO_NUMBERS = re.compile(r"[^\d.,eE+\-\s]|,[ \t\r]*(?:[,\n]|\Z)")
 """Of a text of our own layout, below its header."""
 _HTML = re.compile(r"\s*(?:<\?xml[^>]*>\s*)?<(?:!doctype\s+html|html|head|body|table)\b", re.IGNORECASE)
@@ -178,9 +179,12 @@ def _read(body: str, layout: Layout) -> tuple[list[Column], list[arrow.Ragged]]:
 
 
 def _without_empty(columns: list[Column], layout: Layout) -> tuple[list[Column], tuple[str, ...], tuple[str, ...]]:
-    """Without the columns that trailing separators make."""
+    """Without the columns that trailing separators make, and where a header names
+    the others, leading ones."""
     names = list(layout.header or (str(i + 1) for i in range(layout.fields)))
     units = list(layout.units or ("",) * layout.fields)
+    while columns and columns[0].gaps.all() and layout.header is not None and not names[0].strip():
+        columns, names, units = columns[1:], names[1:], units[1:]
     while columns and columns[-1].gaps.all() and (layout.header is None or not names[-1].strip()):
         columns, names, units = columns[:-1], names[:-1], units[:-1]
     return columns, tuple(names), tuple(units)

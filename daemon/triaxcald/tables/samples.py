@@ -21,6 +21,7 @@ from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
 from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import (
+    BY_NUMBER,
     ERRORS,
     INDEX,
     ISO,
@@ -609,7 +610,7 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     chosen = rows_where(grid, reading.where)
     if grid.named and TIME not in reading.columns and not own:
         grid = with_joined_times(grid)
-    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named)
+    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named, suggested=_by_number(grid, chosen))
     require_one_sensor(grid, chosen)
     for i in roles.outputs:
         require_numbers(grid, i, chosen)
@@ -640,6 +641,30 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     output_unit = _output_unit([names[i].unit for i in roles.outputs])
     kept = _beside(grid, roles, samples.channels, rows[once]) if beside else {}
     return Table(samples, (*remarks, *skipped), output_unit, kept)
+
+
+def _by_number(grid: Grid, chosen: NDArray[np.bool_]) -> str:
+    """The option that names the columns of a table without a header, as far as
+    the cells tell: the time rises throughout, and three columns of numbers
+    follow it or stand alone."""
+    time = next((i for i, c in enumerate(grid.columns) if _never_falls(c, chosen)), None)
+    numbers = [i for i, c in enumerate(grid.columns) if c.share > MOSTLY and i != time]
+    behind = [i for i in numbers if time is None or i > time]
+    of = (behind if len(behind) >= len(OUTPUTS) else numbers)[: len(OUTPUTS)]
+    if len(of) < len(OUTPUTS):
+        return BY_NUMBER
+    outputs = ",".join(f"{axis}={i + 1}" for axis, i in zip(OUTPUTS, of, strict=False))
+    return f"--columns t={time + 1},{outputs}" if time is not None else f"--columns {outputs} --rate HZ"
+
+
+def _never_falls(column: Column, chosen: NDArray[np.bool_]) -> bool:
+    rows = chosen & column.usable
+    values = (column.moments_ns if column.moments_ns is not None else column.numbers)[rows]
+    return (
+        rows.sum() * 2 > chosen.sum()
+        and len(values) > 1
+        and bool((np.diff(values) >= 0).all() and values[-1] > values[0])
+    )
 
 
 def _readings(grid: Grid, roles: Roles, rows: NDArray[np.intp]) -> NDArray[np.float64]:
