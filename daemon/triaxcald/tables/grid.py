@@ -4,8 +4,8 @@ what it means."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow
 from triaxcald.tables.arrow import MOSTLY, Column
+from triaxcald.tables.labelled import labelled
 from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
 from triaxcald.tables.naming import Unclear
 from triaxcald.tables.native_csv import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
@@ -32,7 +33,8 @@ class Grid:
     """Columns of n rows with their names. ``line_of`` says where a row stands,
     as in "line 17". ``head`` are the lines above, and ``ragged`` those that have
     another number of fields: where, and how many. ``ours``: cells are parted
-    and numbers written as in our own layout."""
+    and numbers written as in our own layout. ``passed_over`` counts lines of
+    another kind, by an example."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -42,6 +44,7 @@ class Grid:
     head: tuple[str, ...] = ()
     ragged: tuple[tuple[str, int], ...] = ()
     ours: bool = True
+    passed_over: Mapping[str, int] = field(default_factory=dict)
 
     def called(self, column: int) -> str:
         return f"column {td.hints.clipped(self.names[column])}" if self.named else f"column {column + 1}"
@@ -104,7 +107,17 @@ def grid_of_text(
         raise Unclear("empty file, expected a text table")
     if _HTML.match(text):
         raise Unclear("HTML, expected a text table")
-    return _grid(text, _layout(text, used))
+    found = labelled(text)
+    if found is None:
+        return _grid(text, _layout(text, used))
+    grid = _grid(found.text, found.layout or _layout(found.text, used))
+    line_of = grid.line_of
+    return replace(
+        grid,
+        passed_over=found.passed_over,
+        line_of=(lambda row: line_of(row).replace("line", "record")) if found.records else line_of,
+        ours=False,
+    )
 
 
 def _grid(text: str, layout: Layout) -> Grid:

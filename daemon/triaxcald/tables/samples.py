@@ -638,6 +638,7 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     samples = CsvSamples(time_ns[once], readings[once], held, int(len(once) - once.sum()))
     remarks = [_read_as(grid, roles, timing, renamed, given)]
     remarks += [f"left out: {'; '.join(left_out)}"] if left_out else []
+    remarks += [f"left out: {n} lines as '{td.hints.clipped(line)}'" for line, n in grid.passed_over.items()]
     output_unit = _output_unit([names[i].unit for i in roles.outputs])
     kept = _beside(grid, roles, samples.channels, rows[once]) if beside else {}
     return Table(samples, (*remarks, *skipped), output_unit, kept)
