@@ -24,7 +24,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import clipped, nearest
 from triaxcal_drivers.interface import Device, RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.logs.can_frames import LONGEST_NS
+from triaxcal_drivers.logs.dates import LONGEST_NS
 from triaxcal_drivers.mcap.definitions import Described, Fields, message_types
 from triaxcal_drivers.profile import (
     CHANNELS_MOST,
