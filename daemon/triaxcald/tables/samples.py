@@ -250,6 +250,16 @@ changes rarely."""
 FAR = 1e4
 """Times what nine in ten samples reach: more is no reading, as a knock reaches
 the end of the range."""
+COUNTED = frozenset(("axis", "count", "counts", "activity", "cpm"))
+"""Words in the names of counts of activity."""
+RESTS_LEAST = 0.01
+"""Counts are 0 on all axes at rest, which a wearer does in more epochs than so many."""
+LENGTHS_MOST = 5
+"""By so many times the lengths of accelerations never differ, from the tenth to the
+ninetieth of a hundred: an offset as large as 1 g makes 3.7 times of the same 1 g."""
+_EPOCH = re.compile(
+    r"\bepoch[ _-]*(?:period|length|duration|interval|size)\b[^\d\n]{0,40}(\d+(?:[:.]\d+)*)", re.IGNORECASE
+)
 _SENSORS = re.compile(r"acc|gyr|mag|baro|grav|rotat|orient|linear", re.IGNORECASE)
 
 
@@ -610,10 +620,13 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     chosen = rows_where(grid, reading.where)
     if grid.named and TIME not in reading.columns and not own:
         grid = with_joined_times(grid)
-    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named, suggested=_by_number(grid, chosen))
+    asked = not grid.named and not {*OUTPUTS} <= set(reading.columns)
+    suggested = _by_number(grid, chosen) if asked else BY_NUMBER
+    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named, suggested=suggested)
     require_one_sensor(grid, chosen)
     for i in roles.outputs:
         require_numbers(grid, i, chosen)
+    _require_no_counts(grid, roles.outputs, chosen)
     names = [Name.of(n, u) for n, u in zip(grid.names, grid.units, strict=True)]
     if TIME not in roles.said:
         times = tuple(i for i in roles.time if not is_no_time(grid.columns[i], names[i], chosen))
@@ -654,6 +667,8 @@ def _by_number(grid: Grid, chosen: NDArray[np.bool_]) -> str:
     of = (behind if len(behind) >= len(OUTPUTS) else numbers)[: len(OUTPUTS)]
     if len(of) < len(OUTPUTS):
         return BY_NUMBER
+    if _epoch(grid):
+        _require_no_counts(grid, of, chosen)
     outputs = ",".join(f"{axis}={i + 1}" for axis, i in zip(OUTPUTS, of, strict=False))
     return f"--columns t={time + 1},{outputs}" if time is not None else f"--columns {outputs} --rate HZ"
 
@@ -666,6 +681,36 @@ def _never_falls(column: Column, chosen: NDArray[np.bool_]) -> bool:
         and len(values) > 1
         and bool((np.diff(values) >= 0).all() and values[-1] > values[0])
     )
+
+
+def _require_no_counts(grid: Grid, outputs: Sequence[int], chosen: NDArray[np.bool_]) -> None:
+    """Counts of activity in epochs, as actigraphs write them, are whole numbers from
+    0, and 0 where the unit rests. Gravity is in every acceleration: whole numbers
+    from 0, as of a converter without a sign, keep their length within a few times.
+    Raises Unclear."""
+    columns = [grid.columns[i] for i in outputs]
+    if any(c.whole is None or (c.numbers[chosen & c.usable] < 0).any() for c in columns):
+        return
+    usable = chosen & columns[0].usable & columns[1].usable & columns[2].usable
+    lengths = np.linalg.norm([c.numbers[usable] for c in columns], axis=0)
+    low, high = np.quantile(lengths, (0.1, 0.9)) if len(lengths) else (0.0, 0.0)
+    epoch = _epoch(grid)
+    called = all(set(Name.of(grid.names[i]).words) & COUNTED for i in outputs) and grid.named
+    rests = len(lengths) > 0 and float((lengths == 0).mean()) >= RESTS_LEAST
+    if epoch or (high > LENGTHS_MOST * low and (called or rests)):
+        which = ", ".join(_shown(grid, i) for i in outputs)
+        why = f"'{td.hints.clipped(epoch)}' stands above" if epoch else "gravity is not in them"
+        raise Unclear(
+            f"{which} hold whole numbers from 0, and {why}: counts of activity in epochs, which are not acceleration; "
+            "export the raw samples (ActiGraph: the .gt3x file)"
+        )
+
+
+def _epoch(grid: Grid) -> str:
+    """The line above the table that states an epoch; empty where none does. Raw
+    samples have one of 0."""
+    found = ((line, _EPOCH.search(line)) for line in grid.head)
+    return next((line.strip() for line, m in found if m and re.search("[1-9]", m[1])), "")
 
 
 def _readings(grid: Grid, roles: Roles, rows: NDArray[np.intp]) -> NDArray[np.float64]:
