@@ -36,6 +36,7 @@ KIND_LEAST = 0.1
 one of them."""
 STAMP = "time stamp"
 """Name of the column with the times of a serial monitor."""
+_LETTERS = [[letter] for axis in AXES for letter in (axis, axis.upper())]
 BETWEEN_MOST = 1000
 """Texts between the numbers of lines that are remembered: blanks before a number may
 be of any count."""
@@ -175,13 +176,13 @@ _MOMENT = rf"(?:{MOMENT.pattern}|{DAY_TIME.pattern})(?![\w:.])"
 
 
 def _number(decimal: str) -> str:
-    return rf"(?<![\w.])[+-]?(?:\d+(?:[{decimal}]\d+)?\.?|[{decimal}]\d+)(?:[eE][+-]?\d+)?(?![\d:])"
+    return rf"(?<![\w.])[+-]?(?:\d+(?:[{decimal}]\d+)?\.?|[{decimal}]\d+)(?:[eE][+-]?\d+)?(?!\d|:\d)"
 
 
 def _tokens_of(decimal: str) -> re.Pattern[str]:
     return re.compile(
         rf"(?P<moment>(?<![\w.]){_MOMENT})|(?P<number>{_number(decimal)})|(?P<word>{_WORD})|"
-        r"(?P<mark>[:=]+>?)|(?P<separator>[,;|\t])|(?P<blank>(?:[ \[\](){}<>\"'*#~]|-(?![.\d]))+)|(?P<other>.)"
+        r"(?P<mark>[:=]+>?)|(?P<separator>[,;|\t{}&/$@!])|(?P<blank>(?:[ \[\]()<>\"'*#~]|-(?![.\d]))+)|(?P<other>.)"
     )
 
 
@@ -345,8 +346,10 @@ def _runs(line: str, decimal: str) -> list[_Run] | None:
         if kind == "word":
             words.append(text)
         elif kind == "mark":
-            if not words:
+            if not words and not runs:
                 return None
+            if not words:  # 1234: ax=…
+                continue
             if waiting is not None and len(words) == 1:
                 prefix = " ".join(waiting.words)  # Acc: X=…
             elif waiting is not None:
@@ -410,20 +413,46 @@ def _cells(line: str, decimal: str) -> Cells | None:
         return None
     if any(run.words and not run.marked and len(run.texts) > 1 for run in runs):
         return None  # a table whose rows begin with a name
-    found: list[tuple[str, str, str]] = []
-    stem: list[str] = []
+    labels, source = _labels(runs)
+    found = [
+        (name, text.replace(decimal, "."), run.unit)
+        for run, label in zip(runs, labels, strict=True)
+        for name, text in zip(_names(label, run.texts), run.texts, strict=True)
+    ]
+    return [*_with_unit_of_triple(found), *([("source", source, "")] if source else [])]
+
+
+def _labels(runs: Sequence[_Run]) -> tuple[list[str], str]:
+    """And the words before all of them, which name the source of the line."""
+    found: list[list[str]] = []
+    stem: list[str] = []  # Acceleration X: 0.1, Y: 0.2, Z: 0.3; IMU ax=0.1 ay=0.2 az=0.3
+    last = ""
     for run in runs:
         label = run.words
-        if len(label) > 1 and label[-1].lower() in AXES:
-            stem = label[:-1]  # Acceleration X: 0.1, Y: 0.2, Z: 0.3
-        elif stem and len(label) == 1 and label[0].lower() in AXES:
+        if len(label) > 1:
+            stem, last = label[:-1], label[-1]
+        elif stem and label and _of_another_axis(last, label[0]):
             label = [*stem, *label]
         else:
             stem = []
-        name = " ".join(filter(None, (run.prefix, *label)))
-        texts = [text.replace(decimal, ".") for text in run.texts]
-        found += [(n, text, run.unit) for n, text in zip(_names(name, texts), texts, strict=True)]
-    return _with_unit_of_triple(found)
+        found.append([*run.prefix.split(), *label])
+    # Letters of axes alone need the words before them.
+    source: list[str] = []
+    while len(named := [label for label in found if label]) > 1:
+        shared = len({label[0] for label in named}) == 1 and all(len(label) > 1 for label in named)
+        if not shared or all(label[1:] in _LETTERS for label in named):
+            break
+        source.append(named[0][0])
+        found = [label[1:] for label in found]
+    return [" ".join(label) for label in found], " ".join(source)
+
+
+def _of_another_axis(one: str, other: str) -> bool:
+    """Whether two words differ by x, y, z alone."""
+    if len(one) != len(other):
+        return False
+    apart = [(a, b) for a, b in zip(one.lower(), other.lower(), strict=True) if a != b]
+    return len(apart) == 1 and all(letter in AXES for letter in apart[0])
 
 
 class _Reader:
@@ -433,17 +462,27 @@ class _Reader:
     def __init__(self, decimal: str) -> None:
         self._decimal = decimal
         self._number = re.compile(_number(decimal))
-        self._known: dict[str, Cells] = {}
+        self._known: dict[str, Sequence[tuple[str, str | None, str]]] = {}
 
     def cells(self, line: str) -> Cells | None:
         between = self._number.sub("0", line)
+        numbers = [text.replace(self._decimal, ".") for text in self._number.findall(line)]
         if (known := self._known.get(between)) is not None:
-            numbers = self._number.findall(line)
-            return [(n, t.replace(self._decimal, "."), u) for (n, _, u), t in zip(known, numbers, strict=True)]
+            left = iter(numbers)
+            return [(name, next(left) if text is None else text, unit) for name, text, unit in known]
         cells = _cells(line, self._decimal)
-        texts = [text.replace(self._decimal, ".") for text in self._number.findall(line)]
-        if cells is not None and [text for _, text, _ in cells] == texts and len(self._known) < BETWEEN_MOST:
-            self._known[between] = cells
+        if cells is not None and len(self._known) < BETWEEN_MOST:
+            left = iter([*numbers, ""])
+            upcoming = next(left)
+            pattern: list[tuple[str, str | None, str]] = []
+            for name, text, unit in cells:
+                if text == upcoming:
+                    upcoming = next(left)
+                    pattern.append((name, None, unit))
+                else:
+                    pattern.append((name, text, unit))
+            if sum(text is None for _, text, _ in pattern) == len(numbers):
+                self._known[between] = pattern
         return cells
 
 

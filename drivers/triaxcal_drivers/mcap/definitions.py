@@ -29,7 +29,7 @@ def message_types(name: str, language: str, definition: bytes) -> tuple[str, Map
     """Name of the outermost message, and the fields of each message by its name. A
     type whose part cannot be read has the line as its only field."""
     full = _full(name)
-    text = definition.decode("utf-8-sig", "replace")
+    text = definition.decode("utf-8", "replace").replace("\ufeff", "")  # editors put it before any part
     lines = list(enumerate(re.split(r"\r\n|\r|\n", text), 1))
     parts = list(_parts(full, lines))
     return full, _of_idl(parts) if language == "ros2idl" else {part: _of_msg(part, body) for part, body in parts}
@@ -63,10 +63,12 @@ def _unread(number: int, line: str) -> Described:
 _PRIMITIVE = re.compile(r"bool|byte|char|float(?:32|64)|u?int(?:8|16|32|64)|w?string")
 _MSG_LINE = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<many>\[(?:<=)?\s*(?P<length>\d*)\s*\])?"
-    r"\s+(?P<name>[A-Za-z_]\w*)\s*(?P<rest>$|[=#].*|(?:[-+.\d\"'\[]|true\b|false\b).*)",
+    r"\s+(?P<name>[A-Za-z_]\w*)\s*(?P<rest>$|[=#].*|(?:[-+.\d\"'\[]|true\b|false\b|nan\b|inf\b).*)",
     re.IGNORECASE,
 )
 """A default value, a constant's value or a remark follows the name, or nothing."""
+_MSG_STRING = re.compile(r"(?P<type>w?string)(?:<=\d+)?\s+(?P<name>[A-Za-z_]\w*)\s+[^=\s].*")
+"""The default value of a string may stand without quotes."""
 _ELSEWHERE = {
     "time": "builtin_interfaces/msg/Time",
     "duration": "builtin_interfaces/msg/Duration",
@@ -84,7 +86,9 @@ def _of_msg(owner: str, lines: Lines) -> Fields:
         if not bare or bare.startswith(("#", "@")):
             continue
         found = _MSG_LINE.fullmatch(bare)
-        if found is None:
+        if found is None and (text := _MSG_STRING.fullmatch(bare)):
+            fields.append((text["name"], ("base", text["type"])))
+        elif found is None:
             fields.append(("", _unread(number, bare)))
         elif not found["rest"].startswith("=") or found["many"]:  # a constant is not encoded
             fields.append((found["name"], _msg_type(found, owner)))

@@ -206,13 +206,19 @@ def test_idl_of_real_packages_is_read(end: str) -> None:
     assert CdrReader(name, types, paths, "p").read(b"\0\1\0\0" + data) == [0.5, -9.8, 1e-3, 5, 12.0, 1]
 
 
-UNUSUAL = 'string KIND="a # b"  # remark\nwstring<=4 note "x"\n\tint8  a\t-1 \nbyte[ 2 ] B [1, 2]\nfloat64 x'
+UNUSUAL = """float64 f nan
+string s a text
+string KIND="a # b"  # remark
+wstring<=4 note "x"
+	int8  a	-1
+byte[ 2 ] B [1, 2]
+float64 x"""
 
 
 def test_unusual_lines_of_msg_are_read() -> None:
     name, types = types_of("\ufeff@verbatim\n" + UNUSUAL + "\n$%& behind it")
-    assert [field for field, _ in types[name]] == ["note", "a", "B", "x", ""]
-    data = b"\0\1\0\0" + struct.pack("<Ib2Bxd", 0, -1, 1, 2, 0.25)
+    assert [field for field, _ in types[name]] == ["f", "s", "note", "a", "B", "x", ""]
+    data = b"\0\1\0\0" + struct.pack("<dIIb2B5xd", 0, 0, 0, -1, 1, 2, 0.25)
     assert CdrReader(name, types, [["x"], ["a"]], "p").read(data) == [0.25, -1]
 
 
