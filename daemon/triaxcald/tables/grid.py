@@ -34,7 +34,7 @@ class Grid:
     as in "line 17". ``head`` are the lines above, and ``ragged`` those that have
     another number of fields: where, and how many. ``ours``: cells are parted
     and numbers written as in our own layout. ``passed_over`` counts lines of
-    another kind, by an example."""
+    another kind, by an example. ``labelled``: the names stand in each line."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -45,6 +45,7 @@ class Grid:
     ragged: tuple[tuple[str, int], ...] = ()
     ours: bool = True
     passed_over: Mapping[str, int] = field(default_factory=dict)
+    labelled: bool = False
 
     def called(self, column: int) -> str:
         return f"column {td.hints.clipped(self.names[column])}" if self.named else f"column {column + 1}"
@@ -121,6 +122,7 @@ def grid_of_text(
         passed_over=found.passed_over,
         line_of=(lambda row: line_of(row).replace("line", "record")) if found.records else line_of,
         ours=False,
+        labelled=found.layout is not None,
     )
 
 

@@ -30,6 +30,8 @@ OTHER_UNITS_OF_TIME = frozenset(
 TIMES = frozenset((
     "t", "ts", "time", "times", "timestamp", "timestamps", "zeit", "zeitstempel", "uhrzeit", "temps", "tiempo", "tempo",
     "elapsed", "date", "datetime", "epoch", "epoc", "clock", "heure", "hora", "stamp", "uptime", "utc",
+    "datum", "fecha", "zeitpunkt", "czas", "čas", "tijd", "tijdstip", "tidpunkt", "aika", "zaman", "дата", "время",
+    "时间", "時間", "日時", "시간",
     *(word for word in UNITS_OF_TIME if len(word) > 3),
 ))  # fmt: skip
 INDICES = frozenset((

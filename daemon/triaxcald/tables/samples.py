@@ -113,15 +113,26 @@ def _no_time(grid: Grid, roles: Roles, by_index: bool) -> str:
         if grid.columns[i].strange.any():
             row = int(np.flatnonzero(grid.columns[i].strange)[0])
             held = grid.columns[i].text(row)[:40]
-            return f"{grid.called(i)}: '{held}' is no time (dates as 2026-01-31 12:00:00.25); convert it, or --rate HZ"
+            return _not_understood(grid, i, held)
         falls = np.flatnonzero(np.diff(grid.columns[i].numbers) < 0)
         if len(falls):
             where = f"{grid.line_of(int(falls[0]) + 1)}: {grid.called(i)}"
             return f"{where}: the time falls back, as a counter does that starts again; --rate HZ counts the samples"
+    for i, column in enumerate(grid.columns):
+        held = column.text(int(np.flatnonzero(column.strange)[0]))[:40] if column.strange.mean() > MOSTLY else ""
+        if _CLOCK.search(held):
+            return _not_understood(grid, i, held)
     which = "t=NAME" if grid.named else "t=NUMBER"
     return (
         f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ; "
         "if each row is the mean of a pose: --pose-means"
+    )
+
+
+def _not_understood(grid: Grid, i: int, held: str) -> str:
+    return (
+        f"{grid.called(i)}: '{held}' is a time or date that is not understood, expected one as 2026-01-31 12:00:00.25; "
+        "convert it, or --rate HZ counts the samples"
     )
 
 
@@ -254,6 +265,8 @@ COUNTED = frozenset(("axis", "count", "counts", "activity", "cpm"))
 """Words in the names of counts of activity."""
 RESTS_LEAST = 0.01
 """Counts are 0 on all axes at rest, which a wearer does in more epochs than so many."""
+_CLOCK = re.compile(r"(?<!\d)\d{1,2}(?:[:.h_]|\s?Uhr\s?)\d\d(?!\d)|\d{8}T\d{4}", re.IGNORECASE)
+"""In a text that tells a time of day."""
 LENGTHS_MOST = 5
 """By so many times the lengths of accelerations never differ, from the tenth to the
 ninetieth of a hundred: an offset as large as 1 g makes 3.7 times of the same 1 g."""
@@ -369,9 +382,13 @@ def rows_with_numbers(
         held = grid.columns[i].text(row)
         what = f"'{held[:40]}'" if held else "empty"
         expected = f"a number within {FAR:g} times most others" if i in too_far else "a finite number"
+        if grid.columns[i].moments_ns is not None:
+            expected = "a time of the date and form of the first (dates as 2026-01-31 may change)"
         faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected {expected}")
     for line, fields in grid.ragged[:1]:
-        faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
+        shown = td.hints.clipped(", ".join(Name.of(name).text for name in grid.names))
+        unlike = f"not as the other lines, expected {shown}"
+        faults.append(f"{line}: {unlike if grid.labelled else f'{fields} fields, expected {len(grid.columns)}'}")
     count = int(bad.sum()) + len(grid.ragged)
     if not count:
         return usable, []
