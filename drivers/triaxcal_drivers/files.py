@@ -15,6 +15,7 @@ HEAD = 8192
 """Bytes that are looked at: a document begins with its format, and a TOML file
 names it above its tables, below comments at most."""
 
+_ACTILIFE = (b"SQLite format 3\0", "an SQLite database, as ActiLife's .agd with counts of epochs")
 _MAGICS = (
     (b"\x89MCAP", "an MCAP file"),
     (b"\x1f\x8b", "a gzip file"),
@@ -24,7 +25,7 @@ _MAGICS = (
     (b"\x93NUMPY", "a NumPy file"),
     (b"MDF ", "an MF4 file"),
     (b"LOGG", "a BLF file"),
-    (b"SQLite format 3\0", "an SQLite database, as ActiLife's .agd with counts of epochs"),
+    _ACTILIFE,
 )
 _GT3X = re.compile(rb"PK\x03\x04.{26}(?:log\.bin|activity\.bin|info\.txt|lux\.bin)", re.DOTALL)
 """The first entry of ActiGraph's archive."""
@@ -96,6 +97,8 @@ def _wearable(head: bytes) -> tuple[str, str] | None:
 def converter(data: bytes) -> str:
     """What to do with a file of a wearable that begins with ``data``; else empty."""
     found = _wearable(data[:HEAD])
+    if data.startswith(_ACTILIFE[0]):
+        return "; export the raw samples of the .gt3x file"
     return f"; convert it to CSV with {found[1]}" if found else ""
 
 

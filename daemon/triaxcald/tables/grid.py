@@ -98,10 +98,6 @@ def grid_of_text(
 ) -> Grid:
     """Of the bytes of a file; ``used`` as `layout_of` takes it. Raises
     Unclear."""
-    if how := td.files.converter(whole):
-        raise Unclear(f"{td.files.kind(whole)}, expected a text table{how}")
-    if whole.startswith(b"SQLite format 3\0"):
-        raise Unclear(f"{td.files.kind(whole)}, expected a text table; export the raw samples")
     if whole.startswith((b"\x1f\x8b", b"\x89MCAP", b"PAR1", b"PK\x03\x04")):
         raise Unclear(f"binary data ({_kind_of_file(whole)}), expected a text table")
     try:

@@ -574,6 +574,8 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
         first = next(data, b"")
         if known := td.files.document_kind(first):
             raise Unclear(f"{known}, expected a recording (.mcap) or a table of samples")
+        if how := td.files.converter(first):
+            raise Unclear(f"{td.files.kind(first)}, expected a text table{how}")
         own = replace(reading, wanted=frozenset()) == Reading() and is_native(first)
         if own and holds_text(whole_lines(first)):
             grid = grid_of_own(b"".join(chain((first,), data)), label)
