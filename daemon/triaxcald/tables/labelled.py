@@ -37,6 +37,8 @@ one of them."""
 STAMP = "time stamp"
 """Name of the column with the times of a serial monitor."""
 _LETTERS = [[letter] for axis in AXES for letter in (axis, axis.upper())]
+_COMMAS_PART = re.compile(r"\d,[+-]?\d+,[+-]?\d")
+"""A number between two commas without a blank: no decimal ones."""
 BETWEEN_MOST = 1000
 """Texts between the numbers of lines that are remembered: blanks before a number may
 be of any count."""
@@ -316,12 +318,19 @@ def _table(
 
 
 def _decimal(head: Sequence[str]) -> str:
-    """The comma where, with the point, each label with several numbers had two, as
-    ax=0,12 has."""
-    runs = [run for line in head for run in _runs(line, ".") or ()]
-    several = [run for run in runs if len(run.texts) > 1]
-    pointed = any("." in text for run in runs for text in run.texts)
-    return "," if several and not pointed and all(len(run.texts) == len(",,") for run in several) else "."
+    """The comma where it makes one number of each two that the point leaves, in a
+    label (ax=0,12 ay=1) or in whole lines (acc: 0,12; 0,34; 0,98)."""
+    lines = [runs for line in head if (runs := _runs(line, ".")) and any(run.words for run in runs)]
+    if any("." in text for runs in lines for run in runs for text in run.texts):
+        return "."
+    several = [run for runs in lines for run in runs if len(run.texts) > 1]
+    if several and all(len(run.texts) == 2 for run in several):
+        return ","
+    if any(_COMMAS_PART.search(line) for line in head):
+        return "."
+    counts = [[len(re.findall(_number(mark), line)) for mark in ".,"] for line in head]
+    halved = [by_comma for by_point, by_comma in counts if by_point and by_point == 2 * by_comma]
+    return "," if lines and len(halved) >= MOSTLY * len(head) and min(halved) >= NUMERIC_LEAST else "."
 
 
 @dataclass

@@ -35,6 +35,7 @@ TIMED: dict[str, Line] = {
     "lists": lambda c, t, x, y, z: f"t={t:.2f} acc=[{x}, {y}, {z}] gyr=[1, 2, 3]",
     "brackets": lambda c, t, x, y, z: f"t={t:.2f} gyro=(1 2 3) accel=({x} {y} {z})",
     "decimal commas": lambda c, t, x, y, z: f"t={t:.2f} ax={x:.3f} ay={y:.3f} az={z:.3f}".replace(".", ","),
+    "decimal commas in a list": lambda c, t, x, y, z: f"t: {t:.2f} acc: {x:.3f}; {y:.3f}; {z:.3f}".replace(".", ","),
     "words between": lambda c, t, x, y, z: f"state=OK t={t:.2f} ax={x} ay={y} az={z} mode=run",
     "sensors by prefix": lambda c, t, x, y, z: f"t={t:.2f} Acc: X={x} Y={y} Z={z}; Gyro: X=1 Y=2 Z=3",
     "time of day": lambda c, t, x, y, z: f"{c} ax={x} ay={y} az={z}",
@@ -69,6 +70,8 @@ def test_lines_with_labels_are_read(tmp_path: Path, kind: str) -> None:
 
 UNTIMED: dict[str, Line] = {
     "equals": lambda c, t, x, y, z: f"ax={x} ay={y} az={z}",
+    "commas between whole numbers": lambda c, t, x, y, z: f"acc: {1000 * x:.0f},{1000 * y:.0f},{1000 * z:.0f}",
+    "six of them": lambda c, t, x, y, z: f"a/g: {1000 * x:.0f},{1000 * y:.0f},{1000 * z:.0f},1,2,3",
     "no marks": lambda c, t, x, y, z: f"ax {x} ay {y} az {z}",
     "one label": lambda c, t, x, y, z: f"a/g:\t{x}\t{y}\t{z}\t-12\t30\t5",
     "after a word": lambda c, t, x, y, z: f"Accelerometer: X {x} Y {y} Z {z}",
@@ -84,7 +87,8 @@ def test_lines_without_a_time_are_asked_about_and_counted(tmp_path: Path, kind: 
     text = text_of(UNTIMED[kind])
     assert "--rate HZ" in asked(tmp_path, text)
     table = read(tmp_path, text, Reading(rate=RATE))
-    np.testing.assert_array_equal(table.samples.readings, U)
+    whole = "whole" in kind or "six" in kind
+    np.testing.assert_allclose(table.samples.readings, U * 1000 if whole else U, rtol=1e-12)
     np.testing.assert_array_equal(table.samples.time_ns, np.arange(N) * 20_000_000)
     assert table.output_unit == ("m/s^2" if "m/s^2" in text else "")
     if kind == "lines of other sensors":
