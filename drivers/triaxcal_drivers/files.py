@@ -15,6 +15,7 @@ HEAD = 8192
 """Bytes that are looked at: a document begins with its format, and a TOML file
 names it above its tables, below comments at most."""
 
+_ACTILIFE = (b"SQLite format 3\0", "an SQLite database, as ActiLife's .agd with counts of epochs")
 _MAGICS = (
     (b"\x89MCAP", "an MCAP file"),
     (b"\x1f\x8b", "a gzip file"),
@@ -24,7 +25,29 @@ _MAGICS = (
     (b"\x93NUMPY", "a NumPy file"),
     (b"MDF ", "an MF4 file"),
     (b"LOGG", "a BLF file"),
+    _ACTILIFE,
 )
+_GT3X = re.compile(rb"PK\x03\x04.{26}(?:log\.bin|activity\.bin|info\.txt|lux\.bin)", re.DOTALL)
+"""The first entry of ActiGraph's archive."""
+_WEARABLES = (
+    (
+        re.compile(rb"MD\xfc\x03"),
+        "an Axivity file (.cwa)",
+        "actipy (Python, with calibrate_gravity=False) or GGIRread (R)",
+    ),
+    (
+        re.compile(rb"Device Identity[ \t]*\r?\n"),
+        "a GENEActiv file (.bin)",
+        "actipy (Python, with calibrate_gravity=False) or GGIRread (R)",
+    ),
+    (
+        _GT3X,
+        "an ActiGraph file (.gt3x)",
+        "actipy (Python, with calibrate_gravity=False), pygt3x (Python) or read.gt3x (R)",
+    ),
+)
+"""Files of wearables: how they begin, and packages that convert them to tables. actipy
+calibrates by itself unless it is told not to."""
 _NO_TEXT = re.compile(rb"[\0-\x08\x80-\xff]")  # within the first bytes of all of these, and of no text that begins so
 _MAGIC_HEAD = 64
 _MARK = b"\xef\xbb\xbf"
@@ -52,6 +75,8 @@ def special_kind(data: bytes, *, json: bool = True, toml: bool = True) -> str | 
     """Kind by a magic number or a format key; None for other text and unknown data.
     Without ``json`` or ``toml`` such a document is no special kind."""
     head = data[:HEAD]
+    if found := _wearable(head):
+        return found[0]
     if _NO_TEXT.search(head[:_MAGIC_HEAD]):
         for magic, name in _MAGICS:
             if head.startswith(magic):
@@ -63,6 +88,18 @@ def special_kind(data: bytes, *, json: bool = True, toml: bool = True) -> str | 
         return f"a JSON document{of}" if json else None
     named = _TOML_FORMAT.search((b"\n" + head).split(b"\n[", 1)[0])
     return f"a TOML file of format {named[1].decode()}" if named and toml else None
+
+
+def _wearable(head: bytes) -> tuple[str, str] | None:
+    return next(((name, packages) for begins, name, packages in _WEARABLES if begins.match(head)), None)
+
+
+def converter(data: bytes) -> str:
+    """What to do with a file of a wearable that begins with ``data``; else empty."""
+    found = _wearable(data[:HEAD])
+    if data.startswith(_ACTILIFE[0]):
+        return "; export the raw samples of the .gt3x file"
+    return f"; convert it to CSV with {found[1]}" if found else ""
 
 
 def document_kind(data: bytes) -> str | None:

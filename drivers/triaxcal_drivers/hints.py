@@ -46,7 +46,6 @@ EXTRAS = {
     "serial": "modbus",
     "msgpack": "station",
     "asammdf": "logs",
-    "rosbags": "logs",
     "lz4": "logs",
     "fastapi": "serve",
     "uvicorn": "serve",

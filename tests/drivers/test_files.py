@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from triaxcal_drivers.files import document_kind, inside, kind, open_file, read_whole, size, special_kind
+from triaxcal_drivers.files import converter, document_kind, inside, kind, open_file, read_whole, size, special_kind
 
 
-def _zipped() -> bytes:
+def _zipped(name: str = "a") -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("a", "b")
+        archive.writestr(name, "b")
     return out.getvalue()
 
 
@@ -35,6 +35,11 @@ def _array() -> bytes:
         (bytes.fromhex("50 41 52 31 15 04 15 00"), "a Parquet file"),
         (_zipped(), "a ZIP file, as spreadsheets are"),
         (_array(), "a NumPy file"),
+        (_zipped("log.bin"), "an ActiGraph file (.gt3x)"),
+        (_zipped("activity.bin"), "an ActiGraph file (.gt3x)"),
+        (b"MD\xfc\x03" + bytes(1020), "an Axivity file (.cwa)"),
+        (b"Device Identity\r\nDevice Unique Serial Code:012967\r\n", "a GENEActiv file (.bin)"),
+        (b"SQLite format 3\0" + bytes(100), "an SQLite database, as ActiLife's .agd with counts of epochs"),
         (b'{"format": "triaxcal.calibration/1"}', "a JSON document of format triaxcal.calibration/1"),
         (b'\xef\xbb\xbf {\n "format" : "triaxcal.loop/1",', "a JSON document of format triaxcal.loop/1"),
         (b'{"result": {"format": "triaxcal.loop/1"}}', "a JSON document"),
@@ -57,6 +62,22 @@ def test_a_file_is_named_by_its_first_bytes(data: bytes, expected: str) -> None:
     special = expected.startswith("a") and "binary" not in expected and "empty" not in expected
     assert special_kind(data) == (expected if special else None)
     assert document_kind(data) == (expected if " of format " in expected else None)
+
+
+@pytest.mark.parametrize(
+    ("data", "package"),
+    [
+        (b"MD\xfc\x03" + bytes(1020), "actipy"),
+        (b"Device Identity\nDevice Type:GENEActiv\n", "actipy"),
+        (_zipped("log.bin"), "pygt3x"),
+        (_zipped(), ""),
+        (b"MD5 sums\n", ""),
+        (b"Device Identity,x,y,z\n", ""),
+    ],
+)
+def test_a_file_of_a_wearable_is_told_its_converter(data: bytes, package: str) -> None:
+    assert package in converter(data)
+    assert bool(converter(data)) == bool(package)
 
 
 def test_a_reader_of_json_is_told_of_no_json_and_one_of_toml_of_no_toml() -> None:

@@ -49,8 +49,13 @@ class OneLineParser(argparse.ArgumentParser):
                 unknown.lstrip("-"), (o[2:] for o in self._option_string_actions if o.startswith("--"))
             )
             hint = f"; did you mean --{close}?" if close else ""
+            if not any(word.startswith("-") for word in left) and self._takes_one_recording():
+                hint = f"; {self.prog} takes one recording, `triaxcal diagnose` several of one unit together"
             self.error(f"unrecognized arguments: {' '.join(left)}{hint}")
         return found, left
+
+    def _takes_one_recording(self) -> bool:
+        return any(action.dest == "recording" and action.nargs in (None, "?") for action in self._actions)
 
     def error(self, message: str) -> NoReturn:
         for option, example in (("--sign", "-,-,-"), ("--faces", "-X,-X"), ("--datum", "-Z,-X")):

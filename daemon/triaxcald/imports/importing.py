@@ -259,6 +259,10 @@ def file_told(path: Path) -> dict[str, Any]:
 _REMARKS = {
     "no_times": "the log tells no times: samples are laid at the profile's rate, from zero",
     "no_date": "the log has no date: times count from its start",
+    "date_not_understood": (
+        "a date of the log is not understood and not used ({unread_date}): {then}; in a text log "
+        "write it as Thu May 16 18:16:50.884 2024, and import again"
+    ),
     "date_without_zone": "the log's date names no time zone, and is taken for UTC",
     "times_added_up": "each time in the log is since the line before: they are added up",
     "channels_follow": "the messages come on one channel after another, as of a publisher started anew: all are taken",
@@ -315,7 +319,9 @@ def _off(detail: Mapping[str, Any], seconds: float) -> str:
 def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
     """What a reader of the recording ought to know, a line each; ``seconds``
     are those that the samples cover."""
-    lines = [_REMARKS[name] for name in detail["remarks"]]
+    known = "date_without_zone" in detail["remarks"]
+    then = "times go on from the date before" if known else "times count from the start of the log"
+    lines = [_REMARKS[name].format(unread_date=detail.get("unread_date"), then=then) for name in detail["remarks"]]
     times = detail["times"]
     if times["back"]:
         lines.append(

@@ -304,6 +304,7 @@ class Work:
             "other_records": dict(account.others),
             "damaged": account.damaged,
             "damage": account.damage,
+            "unread_date": account.unread_date,
             "remarks": [*sorted(account.remarks), *(["two_senders"] if importing.two_senders else [])],
             "seconds_by_log": self._readings.seconds,
             "times": self._times.document() | {"equal": importing.times.equal},

@@ -4,8 +4,8 @@ what it means."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,15 @@ import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow
 from triaxcald.tables.arrow import MOSTLY, Column
+from triaxcald.tables.labelled import labelled
 from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
 from triaxcald.tables.naming import Unclear
 from triaxcald.tables.native_csv import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
-_LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
+_LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*|[-=+_*]{3,}[ \t]*)?(?:\n|\Z)"
+"""Blank lines, remarks and the borders of a printed table."""
 _NO_NUMBERS = re.compile(r"[^\d.,eE+\-\s]|,[ \t\r]*(?:[,\n]|\Z)")
 """Of a text of our own layout, below its header."""
 _HTML = re.compile(r"\s*(?:<\?xml[^>]*>\s*)?<(?:!doctype\s+html|html|head|body|table)\b", re.IGNORECASE)
@@ -31,7 +33,8 @@ class Grid:
     """Columns of n rows with their names. ``line_of`` says where a row stands,
     as in "line 17". ``head`` are the lines above, and ``ragged`` those that have
     another number of fields: where, and how many. ``ours``: cells are parted
-    and numbers written as in our own layout."""
+    and numbers written as in our own layout. ``passed_over`` counts lines of
+    another kind, by an example. ``labelled``: the names stand in each line."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -41,6 +44,8 @@ class Grid:
     head: tuple[str, ...] = ()
     ragged: tuple[tuple[str, int], ...] = ()
     ours: bool = True
+    passed_over: Mapping[str, int] = field(default_factory=dict)
+    labelled: bool = False
 
     def called(self, column: int) -> str:
         return f"column {td.hints.clipped(self.names[column])}" if self.named else f"column {column + 1}"
@@ -103,7 +108,18 @@ def grid_of_text(
         raise Unclear("empty file, expected a text table")
     if _HTML.match(text):
         raise Unclear("HTML, expected a text table")
-    return _grid(text, _layout(text, used))
+    found = labelled(text)
+    if found is None:
+        return _grid(text, _layout(text, used))
+    grid = _grid(found.text, found.layout or _layout(found.text, used))
+    line_of = grid.line_of
+    return replace(
+        grid,
+        passed_over=found.passed_over,
+        line_of=(lambda row: line_of(row).replace("line", "record")) if found.records else line_of,
+        ours=False,
+        labelled=found.layout is not None,
+    )
 
 
 def _grid(text: str, layout: Layout) -> Grid:
@@ -178,9 +194,12 @@ def _read(body: str, layout: Layout) -> tuple[list[Column], list[arrow.Ragged]]:
 
 
 def _without_empty(columns: list[Column], layout: Layout) -> tuple[list[Column], tuple[str, ...], tuple[str, ...]]:
-    """Without the columns that trailing separators make."""
+    """Without the columns that trailing separators make, and where a header names
+    the others, leading ones."""
     names = list(layout.header or (str(i + 1) for i in range(layout.fields)))
     units = list(layout.units or ("",) * layout.fields)
+    while columns and columns[0].gaps.all() and layout.header is not None and not names[0].strip():
+        columns, names, units = columns[1:], names[1:], units[1:]
     while columns and columns[-1].gaps.all() and (layout.header is None or not names[-1].strip()):
         columns, names, units = columns[:-1], names[:-1], units[:-1]
     return columns, tuple(names), tuple(units)

@@ -42,6 +42,9 @@ UNIT_TEXT = re.compile(
     r"(?:deg|rad|°)/s|dps|[mµμu]?T|uT|gauss|counts?|lsb|-|1|",
     re.IGNORECASE,
 )
+_RULE = re.compile(r"[^\w\n]*|[_\W]*_{3}[_\W]*")
+"""A line without letters and digits: dashes under a header, the border of a
+printed table."""
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _MARKS = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
 _REMARK = ("#", "%", "//")
@@ -98,6 +101,12 @@ def _decoded(data: bytes) -> str:
 def is_remark(line: str, separator: str) -> bool:
     """Whether a line without blanks about it is none of the table's."""
     return line.startswith(_REMARK) or (separator != ";" and line.startswith(";"))
+
+
+def is_rule(line: str) -> bool:
+    """Whether a line is drawn, and holds neither names nor numbers; a blank one
+    is none."""
+    return bool(line.strip()) and bool(_RULE.fullmatch(line))
 
 
 def layout_of(
@@ -251,11 +260,14 @@ def _above(lines: Sequence[str], run: _Run, decimal: str, labelled: bool) -> Lay
 def _unlike(lines: Sequence[str], run: _Run) -> tuple[int, int] | None:
     """The line right above the samples, where it has several fields and no
     number."""
-    if not lines or not lines[-1].strip():
+    at = len(lines) - 1
+    while at >= 0 and is_rule(lines[at]):
+        at -= 1
+    if at < 0 or not lines[at].strip():
         return None
-    row = split(lines[-1], run.separator)
+    row = split(lines[at], run.separator)
     few = len(row) < NUMERIC_LEAST or any(NUMBER.fullmatch(f) for f in row)
-    return None if few else (len(lines) - 1, len(row))
+    return None if few else (at, len(row))
 
 
 def _first_after(lines: Sequence[str], run: _Run, at: int, header: bool) -> int:
@@ -269,6 +281,7 @@ def _first_after(lines: Sequence[str], run: _Run, at: int, header: bool) -> int:
             return i
         if (
             lines[i].strip()
+            and not is_rule(lines[i])
             and not is_remark(lines[i].strip(), run.separator)
             and not all(map(UNIT_TEXT.fullmatch, row))
         ):
@@ -289,7 +302,7 @@ def _names(line: str, run: _Run, labelled: bool) -> list[str] | None:
     """Names for all fields of a line that could be the header; None where it is
     not. ``labelled``: see `_labelled`."""
     bare = line.strip(" ").lstrip("#%/;").strip(" ") if is_remark(line.strip(), run.separator) else line
-    if not bare.strip():
+    if not bare.strip() or is_rule(bare):
         return None
     row = split(bare, run.separator)
     if len(row) == run.fields + 1 and row[-1].lower() in (

@@ -30,6 +30,8 @@ OTHER_UNITS_OF_TIME = frozenset(
 TIMES = frozenset((
     "t", "ts", "time", "times", "timestamp", "timestamps", "zeit", "zeitstempel", "uhrzeit", "temps", "tiempo", "tempo",
     "elapsed", "date", "datetime", "epoch", "epoc", "clock", "heure", "hora", "stamp", "uptime", "utc",
+    "datum", "fecha", "zeitpunkt", "czas", "čas", "tijd", "tijdstip", "tidpunkt", "aika", "zaman", "дата", "время",
+    "时间", "時間", "日時", "시간",
     *(word for word in UNITS_OF_TIME if len(word) > 3),
 ))  # fmt: skip
 INDICES = frozenset((
@@ -87,6 +89,7 @@ OUTPUTS = ("ux", "uy", "uz")
 ERRORS = ("se_ux", "se_uy", "se_uz")
 """Standard errors of pose means."""
 TIME = "t"
+BY_NUMBER = "--columns t=1,ux=2,uy=3,uz=4"
 AXES = "xyz"
 NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 ISO, INDEX = "iso", "index"
@@ -248,9 +251,11 @@ def parse_columns(text: str) -> dict[str, str]:
     return found
 
 
-def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str], *, named: bool) -> Roles:
+def roles_of(
+    names: Sequence[str], units: Sequence[str], said: Mapping[str, str], *, named: bool, suggested: str = BY_NUMBER
+) -> Roles:
     """``named`` is False where the table has no header and ``names`` are
-    numbers. Raises Unclear."""
+    numbers; ``suggested`` is what the user could say then. Raises Unclear."""
     given = {role: column_of(names, column, named=named) for role, column in said.items()}
     by_column: dict[int, str] = {}
     for role, column in given.items():
@@ -266,7 +271,9 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
         lacking = ", ".join(axis for axis in OUTPUTS if axis not in given)
         raise Unclear(f"--columns names no {lacking}; name all three outputs")
     else:
-        outputs = _outputs(parsed, triples, named=named)
+        if not named:
+            raise Unclear(f"no header over {len(names)} columns; name the columns by number: {suggested}")
+        outputs = _outputs(parsed, triples)
     alike = [t for t in triples if t.kind in (Kind.ACCELERATION, Kind.NOT_KNOWN) and t.columns != outputs]
     rivals = tuple(i for t in alike for i in t.columns)
     others = [i for i in free if i not in outputs]
@@ -331,12 +338,7 @@ def _folded(names: Sequence[str]) -> list[str]:
     return [n.lower() for n in names]
 
 
-def _outputs(names: Sequence[Name], triples: Sequence[Triple], *, named: bool) -> tuple[int, int, int]:
-    if not named:
-        raise Unclear(
-            f"no header over {len(names)} columns; name the columns by number: "
-            f"--columns {'t=1,ux=2,uy=3,uz=4' if len(names) > 3 else 'ux=1,uy=2,uz=3 --rate HZ'}"
-        )
+def _outputs(names: Sequence[Name], triples: Sequence[Triple]) -> tuple[int, int, int]:
     own = [next((i for i, n in enumerate(names) if n.text == axis), None) for axis in OUTPUTS]
     if None not in own and len([n.text for n in names if n.text in OUTPUTS]) == len(OUTPUTS):
         return own[0], own[1], own[2]  # type: ignore[return-value]

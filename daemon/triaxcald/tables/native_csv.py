@@ -87,6 +87,7 @@ TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
 FIELDS_MOST = 1000  # a table of numbers has some ten
 _NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros, 308 of them
 _SKIP = "--skip-bad leaves such lines out"
+_DASHES = re.compile(rb"[^0-9A-Za-z.]*(?:-{2}|={2}|_{2})[^0-9A-Za-z.]*")
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMENTS = re.compile(r"^(?:[ \t]*#[^\n]*(?:\n|\Z))++", re.MULTILINE)
 _BLANK = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
@@ -124,9 +125,13 @@ def samples_of_blocks(data: Iterable[bytes], label: str) -> CsvSamples:
 
 
 def is_native(head: bytes) -> bool:
-    """Whether text that begins so has our header, behind comments at most."""
+    """Whether text that begins so has our header, behind comments at most; below it
+    our layout draws no dashes."""
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
-    first = next((line for line in map(bytes.strip, lines) if line and not line.startswith(b"#")), b"")
+    told = (line for line in map(bytes.strip, lines) if line and not line.startswith(b"#"))
+    first, second = next(told, b""), next(told, b"")
+    if _DASHES.fullmatch(second):
+        return False
     return [field.strip() for field in first.split(b",")][: len(REQUIRED)] == [n.encode() for n in REQUIRED]
 
 

@@ -21,6 +21,7 @@ from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
 from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import (
+    BY_NUMBER,
     ERRORS,
     INDEX,
     ISO,
@@ -112,15 +113,26 @@ def _no_time(grid: Grid, roles: Roles, by_index: bool) -> str:
         if grid.columns[i].strange.any():
             row = int(np.flatnonzero(grid.columns[i].strange)[0])
             held = grid.columns[i].text(row)[:40]
-            return f"{grid.called(i)}: '{held}' is no time (dates as 2026-01-31 12:00:00.25); convert it, or --rate HZ"
+            return _not_understood(grid, i, held)
         falls = np.flatnonzero(np.diff(grid.columns[i].numbers) < 0)
         if len(falls):
             where = f"{grid.line_of(int(falls[0]) + 1)}: {grid.called(i)}"
             return f"{where}: the time falls back, as a counter does that starts again; --rate HZ counts the samples"
+    for i, column in enumerate(grid.columns):
+        held = column.text(int(np.flatnonzero(column.strange)[0]))[:40] if column.strange.mean() > MOSTLY else ""
+        if _CLOCK.search(held):
+            return _not_understood(grid, i, held)
     which = "t=NAME" if grid.named else "t=NUMBER"
     return (
         f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ; "
         "if each row is the mean of a pose: --pose-means"
+    )
+
+
+def _not_understood(grid: Grid, i: int, held: str) -> str:
+    return (
+        f"{grid.called(i)}: '{held}' is a time or date that is not understood, expected one as 2026-01-31 12:00:00.25; "
+        "convert it, or --rate HZ counts the samples"
     )
 
 
@@ -249,6 +261,18 @@ changes rarely."""
 FAR = 1e4
 """Times what nine in ten samples reach: more is no reading, as a knock reaches
 the end of the range."""
+COUNTED = frozenset(("axis", "count", "counts", "activity", "cpm"))
+"""Words in the names of counts of activity."""
+RESTS_LEAST = 0.01
+"""Counts are 0 on all axes at rest, which a wearer does in more epochs than so many."""
+_CLOCK = re.compile(r"(?<!\d)\d{1,2}(?:[:.h_]|\s?Uhr\s?)\d\d(?!\d)|\d{8}T\d{4}", re.IGNORECASE)
+"""In a text that tells a time of day."""
+LENGTHS_MOST = 5
+"""By so many times the lengths of accelerations never differ, from the tenth to the
+ninetieth of a hundred: an offset as large as 1 g makes 3.7 times of the same 1 g."""
+_EPOCH = re.compile(
+    r"\bepoch[ _-]*(?:period|length|duration|interval|size)\b[^\d\n]{0,40}(\d+(?:[:.]\d+)*)", re.IGNORECASE
+)
 _SENSORS = re.compile(r"acc|gyr|mag|baro|grav|rotat|orient|linear", re.IGNORECASE)
 
 
@@ -358,9 +382,13 @@ def rows_with_numbers(
         held = grid.columns[i].text(row)
         what = f"'{held[:40]}'" if held else "empty"
         expected = f"a number within {FAR:g} times most others" if i in too_far else "a finite number"
+        if grid.columns[i].moments_ns is not None:
+            expected = "a time of the date and form of the first (dates as 2026-01-31 may change)"
         faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected {expected}")
     for line, fields in grid.ragged[:1]:
-        faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
+        shown = td.hints.clipped(", ".join(Name.of(name).text for name in grid.names))
+        unlike = f"not as the other lines, expected {shown}"
+        faults.append(f"{line}: {unlike if grid.labelled else f'{fields} fields, expected {len(grid.columns)}'}")
     count = int(bad.sum()) + len(grid.ragged)
     if not count:
         return usable, []
@@ -546,6 +574,8 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
         first = next(data, b"")
         if known := td.files.document_kind(first):
             raise Unclear(f"{known}, expected a recording (.mcap) or a table of samples")
+        if how := td.files.converter(first):
+            raise Unclear(f"{td.files.kind(first)}, expected a text table{how}")
         own = replace(reading, wanted=frozenset()) == Reading() and is_native(first)
         if own and holds_text(whole_lines(first)):
             grid = grid_of_own(b"".join(chain((first,), data)), label)
@@ -609,10 +639,13 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     chosen = rows_where(grid, reading.where)
     if grid.named and TIME not in reading.columns and not own:
         grid = with_joined_times(grid)
-    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named)
+    asked = not grid.named and not {*OUTPUTS} <= set(reading.columns)
+    suggested = _by_number(grid, chosen) if asked else BY_NUMBER
+    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named, suggested=suggested)
     require_one_sensor(grid, chosen)
     for i in roles.outputs:
         require_numbers(grid, i, chosen)
+    _require_no_counts(grid, roles.outputs, chosen)
     names = [Name.of(n, u) for n, u in zip(grid.names, grid.units, strict=True)]
     if TIME not in roles.said:
         times = tuple(i for i in roles.time if not is_no_time(grid.columns[i], names[i], chosen))
@@ -637,9 +670,66 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     samples = CsvSamples(time_ns[once], readings[once], held, int(len(once) - once.sum()))
     remarks = [_read_as(grid, roles, timing, renamed, given)]
     remarks += [f"left out: {'; '.join(left_out)}"] if left_out else []
+    remarks += [f"left out: {n} lines as '{td.hints.clipped(line)}'" for line, n in grid.passed_over.items()]
     output_unit = _output_unit([names[i].unit for i in roles.outputs])
     kept = _beside(grid, roles, samples.channels, rows[once]) if beside else {}
     return Table(samples, (*remarks, *skipped), output_unit, kept)
+
+
+def _by_number(grid: Grid, chosen: NDArray[np.bool_]) -> str:
+    """The option that names the columns of a table without a header, as far as
+    the cells tell: the time rises throughout, and three columns of numbers
+    follow it or stand alone."""
+    time = next((i for i, c in enumerate(grid.columns) if _never_falls(c, chosen)), None)
+    numbers = [i for i, c in enumerate(grid.columns) if c.share > MOSTLY and i != time]
+    behind = [i for i in numbers if time is None or i > time]
+    of = (behind if len(behind) >= len(OUTPUTS) else numbers)[: len(OUTPUTS)]
+    if len(of) < len(OUTPUTS):
+        return BY_NUMBER
+    if _epoch(grid):
+        _require_no_counts(grid, of, chosen)
+    outputs = ",".join(f"{axis}={i + 1}" for axis, i in zip(OUTPUTS, of, strict=False))
+    return f"--columns t={time + 1},{outputs}" if time is not None else f"--columns {outputs} --rate HZ"
+
+
+def _never_falls(column: Column, chosen: NDArray[np.bool_]) -> bool:
+    rows = chosen & column.usable
+    values = (column.moments_ns if column.moments_ns is not None else column.numbers)[rows]
+    return (
+        rows.sum() * 2 > chosen.sum()
+        and len(values) > 1
+        and bool((np.diff(values) >= 0).all() and values[-1] > values[0])
+    )
+
+
+def _require_no_counts(grid: Grid, outputs: Sequence[int], chosen: NDArray[np.bool_]) -> None:
+    """Counts of activity in epochs, as actigraphs write them, are whole numbers from
+    0, and 0 where the unit rests. Gravity is in every acceleration: whole numbers
+    from 0, as of a converter without a sign, keep their length within a few times.
+    Raises Unclear."""
+    columns = [grid.columns[i] for i in outputs]
+    if any(c.whole is None or (c.numbers[chosen & c.usable] < 0).any() for c in columns):
+        return
+    usable = chosen & columns[0].usable & columns[1].usable & columns[2].usable
+    lengths = np.linalg.norm([c.numbers[usable] for c in columns], axis=0)
+    low, high = np.quantile(lengths, (0.1, 0.9)) if len(lengths) else (0.0, 0.0)
+    epoch = _epoch(grid)
+    called = all(set(Name.of(grid.names[i]).words) & COUNTED for i in outputs) and grid.named
+    rests = len(lengths) > 0 and float((lengths == 0).mean()) >= RESTS_LEAST
+    if epoch or (high > LENGTHS_MOST * low and (called or rests)):
+        which = ", ".join(_shown(grid, i) for i in outputs)
+        why = f"'{td.hints.clipped(epoch)}' stands above" if epoch else "gravity is not in them"
+        raise Unclear(
+            f"{which} hold whole numbers from 0, and {why}: counts of activity in epochs, which are not acceleration; "
+            "export the raw samples (ActiGraph: the .gt3x file)"
+        )
+
+
+def _epoch(grid: Grid) -> str:
+    """The line above the table that states an epoch; empty where none does. Raw
+    samples have one of 0."""
+    found = ((line, _EPOCH.search(line)) for line in grid.head)
+    return next((line.strip() for line, m in found if m and re.search("[1-9]", m[1])), "")
 
 
 def _readings(grid: Grid, roles: Roles, rows: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
-    from triaxcal_drivers.logs.can_frames import EXTENDED, LONGEST_NS, Account, LoggedFrame, Remark
+    from triaxcal_drivers.logs.can_frames import EXTENDED, Account, LoggedFrame, Remark
+    from triaxcal_drivers.logs.dates import LONGEST_NS
     from triaxcal_drivers.logs.kinds import MCAP, MCAP_KIND, Kind, Log, opened
 
 _NAMES = {
     "can_frames": (
         "Account",
         "EXTENDED",
-        "LONGEST_NS",
         "LoggedFrame",
         "Remark",
     ),
+    "dates": ("LONGEST_NS",),
     "kinds": (
         "Kind",
         "Log",

@@ -26,13 +26,15 @@ from triaxcal_drivers.logs.can_frames import (
     Account,
     LoggedFrame,
     Remark,
-    date_ns,
     nanoseconds,
     numbered,
     whole,
 )
+from triaxcal_drivers.logs.dates import date_ns, text_of
 
-HEAD = re.compile(rb"(?:date\s+\w+\s+\w+|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version\s+\d)", re.I)
+HEAD = re.compile(
+    rb"(?:date\s+\w+\s+\w+|date\s.*\d:\d\d:\d\d|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version\s+\d)", re.I
+)
 _DATE = re.compile(rb"(?:date|begin\s+triggerblock)\s+(.*)", re.I)
 _BASE = re.compile(rb"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.I)
 _EVENT = re.compile(rb"(\d{1,12})\.(\d{1,9})\s+(.*)")
@@ -43,6 +45,7 @@ _FD = re.compile(
     rb"(?:\s+(.*))?$",
     re.I,
 )
+_WORDS = re.compile(rb"[^\d:=]+")
 _ALMOST = re.compile(rb"\d{1,3}\s+\S+\s+(?:Rx|Tx)\b|CANFD\b", re.I)
 _IDENTIFIER = re.compile(rb"([0-9A-Fa-f]+)(x?)$", re.I)
 _DECLARED = re.compile(rb"\bID\s*=\s*(\d{1,10})(x?)", re.I)
@@ -56,14 +59,13 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
     for number, line in numbered(stream, account):
         event = _EVENT.match(line)
         if event is None:
-            if not reader.head(line):
+            if not reader.head(line, f"line {number}"):
                 account.note(f"line {number}", "expected an event of an ASC log")
             continue
         frame = reader.event(event, f"line {number}")
         if frame is not None:
             yield frame
-    if Remark.DATE_WITHOUT_ZONE not in account.remarks:
-        account.remarks.add(Remark.NO_DATE)
+    account.without_date()
 
 
 @dataclass
@@ -86,8 +88,10 @@ class _Reader:
     start_ns: int = 0
     now_ns: int = 0
     date_ns: int | None = None  # date without an event after it
+    framed: bool = False  # whether the first frame has come
+    start_words: bytes = b""
 
-    def head(self, line: bytes) -> bool:
+    def head(self, line: bytes, where: str) -> bool:
         """Reads a line that is no event; whether the format allows it."""
         if base := _BASE.match(line):
             self.base = 16 if base[1].lower() == b"hex" else 10
@@ -95,14 +99,15 @@ class _Reader:
             if self.relative:
                 self.account.remarks.add(Remark.TIMES_ADDED_UP)
         elif date := _DATE.match(line):
-            found = date_ns(date[1].decode("cp1252", "replace"))
-            if found is not None:
-                self.date_ns = found
-                self.account.remarks.add(Remark.DATE_WITHOUT_ZONE)
+            text = text_of(date[1])
+            found = date_ns(text)
+            self.account.date(found, text, where)
+            self.date_ns = self.date_ns if found is None else found
         return _PASSED_OVER.match(line) is not None
 
     def event(self, event: re.Match[bytes], where: str) -> LoggedFrame | None:
-        self._advance(nanoseconds(event[1], event[2]))
+        written_ns = nanoseconds(event[1], event[2])
+        self._advance(written_ns)
         what = event[3]
         if fd := _FD.match(what):
             return self._fd(fd, where)
@@ -112,9 +117,16 @@ class _Reader:
             return LoggedFrame(self.now_ns, 0, ERROR, b"", error[1].decode())
         if _ALMOST.match(what):
             self.account.note(where, "a frame that cannot be read")
-        elif what != b"Start of measurement":
+        elif not self._is_start(what, written_ns):
             self.account.other("event")
         return None
+
+    def _is_start(self, what: bytes, written_ns: int) -> bool:
+        """Whether an event is the start of a measurement: its words, in the language
+        of the program, come at time zero before all frames."""
+        if not self.framed and written_ns == 0 and _WORDS.fullmatch(what):
+            self.start_words = what
+        return what in (self.start_words, b"Start of measurement")
 
     def _advance(self, written_ns: int) -> None:
         """Sets the time of the next event."""
@@ -169,6 +181,7 @@ class _Reader:
         if data is None or source > (EXTENDED_MOST if flags & EXTENDED else STANDARD_MOST):
             self.account.note(where, "a frame that cannot be read")
             return None
+        self.framed = True
         return LoggedFrame(self.now_ns, source, flags, data, channel.decode())
 
     def _identifier(self, name: bytes, rest: bytes) -> tuple[int, int] | None:

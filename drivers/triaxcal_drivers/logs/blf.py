@@ -25,9 +25,8 @@ from triaxcal_drivers.logs.can_frames import (
     SWITCHED,
     Account,
     LoggedFrame,
-    Remark,
-    utc_ns,
 )
+from triaxcal_drivers.logs.dates import utc_ns
 
 MAGIC = b"LOGG"
 OBJECT_MOST = 16 * 2**20
@@ -90,7 +89,9 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
 def _start_ns(system_time: list[int], account: Account) -> int:
     year, month, _, day, hour, minute, second, ms = system_time
     time_ns = utc_ns(year, month, day, hour, minute, second)
-    account.remarks.add(Remark.NO_DATE if time_ns is None else Remark.DATE_WITHOUT_ZONE)
+    if any(system_time):
+        account.date(time_ns, f"{year}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}", "header")
+    account.without_date()
     return 0 if time_ns is None else time_ns + ms * 1_000_000
 
 

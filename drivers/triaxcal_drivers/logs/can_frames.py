@@ -1,17 +1,16 @@
 """Results of the log readers: frames, and an account of the other contents of a log.
-Also the lines of text logs and the dates in them."""
+Also the lines of text logs."""
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from enum import StrEnum, auto
 from itertools import chain
 from typing import BinaryIO, NamedTuple
 
+from triaxcal_drivers.hints import clipped
 from triaxcal_drivers.interface import RawFlag
 
 EXTENDED, REMOTE, ERROR, FD, SWITCHED, SENT = (
@@ -50,6 +49,7 @@ class Remark(StrEnum):
 
     NO_TIMES = auto()
     NO_DATE = auto()  # times count from the start of the log
+    DATE_NOT_UNDERSTOOD = auto()  # `Account.unread_date` has it
     DATE_WITHOUT_ZONE = auto()  # interpreted as UTC
     TIMES_ADDED_UP = auto()  # each counts from the previous line
 
@@ -58,10 +58,12 @@ class Remark(StrEnum):
 class Account:
     """Contents of a log other than frames. ``damaged`` counts places without a valid
     record; ``damage`` tells the first of them and the expected record. ``others``
-    counts records that make no frame, by their kind."""
+    counts records that make no frame, by their kind. ``unread_date`` is the first date
+    that is not understood, as the log has it, with its place."""
 
     damaged: int = 0
     damage: str = ""
+    unread_date: str = ""
     others: Counter[str] = field(default_factory=Counter)
     remarks: set[Remark] = field(default_factory=set)
 
@@ -69,30 +71,29 @@ class Account:
         """Counts a record that makes no frame."""
         self.others[what if what in self.others or len(self.others) < OTHERS_MOST else "further kinds"] += count
 
+    def date(self, time_ns: int | None, text: str, where: str) -> None:
+        """Tells whether a date of the log is understood. ``text`` is the date as it
+        stands there."""
+        self.remarks.add(Remark.DATE_NOT_UNDERSTOOD if time_ns is None else Remark.DATE_WITHOUT_ZONE)
+        if time_ns is None and not self.unread_date:
+            self.unread_date = f"{where}: '{clipped(text)}'"
+
+    def without_date(self) -> None:
+        """At the end of a log: it may have had none."""
+        if not self.remarks & {Remark.DATE_NOT_UNDERSTOOD, Remark.DATE_WITHOUT_ZONE}:
+            self.remarks.add(Remark.NO_DATE)
+
     def note(self, where: str, what: str) -> None:
         """Counts a damaged place."""
         self.damaged += 1
         self.damage = self.damage or f"{where}: {what}"
 
 
-LONGEST_NS = 2**62
-"""A hundred and forty-six years. A longer time, since the epoch or between two times,
-is damage."""
 UNTIMED_MOST = 100_000
 """Most frames without a time that wait for one with a time, some tens of MB."""
 
 Placed = tuple[str, LoggedFrame | str]
 """A place in a log, and its frame or the description of its damage."""
-
-
-def utc_ns(year: int, month: int, day: int, hour: int, minute: int, second: int) -> int | None:
-    """Nanoseconds since the epoch; None if the calendar has no such moment, or if it is
-    before the epoch or beyond `LONGEST_NS`."""
-    try:
-        seconds = int(datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp())
-    except ValueError:
-        return None
-    return seconds * 1_000_000_000 if 0 <= seconds * 1_000_000_000 < LONGEST_NS else None
 
 
 def timed(found: Iterator[Placed], account: Account) -> Iterator[LoggedFrame]:
@@ -130,18 +131,6 @@ BLOCK = 2**16  # bytes of one read
 LINE_MOST = 4096  # bytes; a CAN FD frame of Vector's has some 400
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8, which editors of Windows put before the first line
 
-_MONTHS = {
-    name: number
-    for names in (
-        "jan feb mar apr may jun jul aug sep oct nov dec",
-        "jan feb mär apr mai jun jul aug sep okt nov dez",
-    )
-    for number, name in enumerate(names.split(), 1)
-}
-_DATE = re.compile(
-    r"(?:\w+\.?\s+)?(\w{3})\w*\.?\s+(\d{1,2})\s+(\d{1,2}):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*(am|pm)?\s+(\d{4})", re.I
-)
-
 
 def numbered(stream: BinaryIO, account: Account) -> Iterator[tuple[int, bytes]]:
     """Each line that is not empty, with its number from 1, without outer blanks and
@@ -177,17 +166,3 @@ def whole(text: str | bytes, base: int = 10) -> int:
 def nanoseconds(seconds: bytes, fraction: bytes) -> int:
     """Nanoseconds by the two parts of a decimal number of seconds."""
     return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, b"0") or 0)
-
-
-def date_ns(text: str) -> int | None:
-    """Nanoseconds since the epoch of a date like "Wed Nov 25 04:38:43.125 pm 2026",
-    interpreted as UTC; None for another text."""
-    match = _DATE.search(text)
-    month = _MONTHS.get(match[1].lower()) if match else None
-    if match is None or month is None:
-        return None
-    hour = int(match[3])
-    if match[7]:
-        hour = hour % 12 + (12 if match[7].lower() == "pm" else 0)
-    time_ns = utc_ns(int(match[8]), month, int(match[2]), hour, int(match[4]), int(match[5]))
-    return None if time_ns is None else time_ns + int((match[6] or "0").ljust(9, "0"))

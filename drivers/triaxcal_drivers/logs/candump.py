@@ -28,8 +28,8 @@ from triaxcal_drivers.logs.can_frames import (
     nanoseconds,
     numbered,
     timed,
-    utc_ns,
 )
+from triaxcal_drivers.logs.dates import utc_ns
 
 LOG = re.compile(
     rb"\((\d{1,12})\.(\d{1,9})\)\s+(\S{1,64})\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"

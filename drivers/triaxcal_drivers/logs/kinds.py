@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.files import open_file, special_kind
+from triaxcal_drivers.files import converter, open_file, special_kind
 from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
 from triaxcal_drivers.logs.can_frames import BYTE_ORDER_MARK, Account, LoggedFrame
 
@@ -115,7 +115,7 @@ def opened(path: Path) -> Iterator[Log]:
         if kind is None:
             hint = "; the file is empty" if not head else ""
             if known := special_kind(head):
-                hint = f"; the file is {known}"
+                hint = f"; the file is {known}{converter(head)}"
             raise LogError(f"{path}: no log of a known kind, expected {NAMES}{hint}")
         # A reader that seeks needs an uncompressed copy.
         seeks = kind.seeks if isinstance(kind, Kind) else True

@@ -29,7 +29,6 @@ from triaxcal_drivers.logs.can_frames import (
     EXTENDED_MOST,
     FD,
     FD_MOST,
-    LONGEST_NS,
     REMOTE,
     SENT,
     SWITCHED,
@@ -37,6 +36,7 @@ from triaxcal_drivers.logs.can_frames import (
     LoggedFrame,
     Remark,
 )
+from triaxcal_drivers.logs.dates import LONGEST_NS
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
 RECORDS_AT_ONCE = 8192

@@ -19,17 +19,16 @@ from triaxcal_drivers.logs.can_frames import (
     FD,
     FD_LENGTHS,
     FD_MOST,
-    LONGEST_NS,
     REMOTE,
     SENT,
     STANDARD_MOST,
     SWITCHED,
     Account,
     LoggedFrame,
-    Remark,
     numbered,
     whole,
 )
+from triaxcal_drivers.logs.dates import LONGEST_NS
 
 LINE = re.compile(rb"\s*\d+\)?\s+\d+(?:\.\d+)?\s+\S+\s+\S+")
 HEAD = re.compile(rb";(?:\$FILEVERSION\s*=|\$STARTTIME\s*=|#{40})")
@@ -64,7 +63,9 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
             if text.startswith(";$FILEVERSION"):
                 columns = _COLUMNS.get(text.partition("=")[2].strip(), columns)
             elif text.startswith(";$STARTTIME"):
-                start_ns = _start_ns(text.partition("=")[2])
+                started = text.partition("=")[2].strip()
+                start_ns = _start_ns(started)
+                account.date(start_ns, started, f"line {number}")
             elif text.startswith(";$COLUMNS"):
                 columns = text.partition("=")[2].replace(",", "").strip()
         else:
@@ -75,13 +76,14 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
                 continue
             if frame is not None:
                 yield frame
-    account.remarks.add(Remark.NO_DATE if start_ns is None else Remark.DATE_WITHOUT_ZONE)
+    account.without_date()
 
 
 def _start_ns(text: str) -> int | None:
-    if not _DAYS.match(text.strip()):
+    days = text.replace(",", ".")
+    if not _DAYS.match(days):
         return None
-    time_ns = int((Decimal(text.strip()) - _DAY_ZERO) * _DAY_NS)
+    time_ns = int((Decimal(days) - _DAY_ZERO) * _DAY_NS)
     return time_ns if 0 <= time_ns < LONGEST_NS else None
 
 

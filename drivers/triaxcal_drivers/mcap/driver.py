@@ -1,11 +1,9 @@
 """Sensors whose samples are messages in MCAP files: their profile, the decoder of
 a stream (one sample a message, in the order of the log), and the entry point
-``mcap``. The one file that imports rosbags.
+``mcap``.
 
 The log tells the encoding of its messages; a recording stores it beside its profile
-(`MessageSchema`). Of two libraries that read definitions of ROS 2 messages,
-mcap-ros2-support refuses capitals in the names of fields, which real packages have.
-rosbags parses the definitions. Its decoders are not used, as it makes them by running
+(`MessageSchema`). The decoders of rosbags are not used, as it makes them by running
 generated Python. Of CDR, ROS 2's encoding, this file decodes the requested fields
 alone. It skips all others and accepts no length beyond the message.
 """
@@ -15,7 +13,6 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,9 +22,10 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.hints import nearest
+from triaxcal_drivers.hints import clipped, nearest
 from triaxcal_drivers.interface import Device, RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.logs.can_frames import LONGEST_NS
+from triaxcal_drivers.logs.dates import LONGEST_NS
+from triaxcal_drivers.mcap.definitions import Described, Fields, message_types
 from triaxcal_drivers.profile import (
     CHANNELS_MOST,
     READING_CHANNELS,
@@ -83,46 +81,6 @@ class MessageSchema:
             raise ProfileError(f"{where}: expected a description of messages ({FORMAT})") from e
 
 
-_IDL_PARTS = re.compile(r"^={80}\nIDL: .*\n", re.MULTILINE)
-"""Separator between the files of a definition in IDL (rosbag2)."""
-
-Fields = Sequence[tuple[str, "Described"]]
-Described = tuple[str, Any]
-"""``("base", name)``, ``("message", name)``, ``("array", (element, length))`` or
-``("sequence", element)``."""
-
-
-def message_types(name: str, language: str, definition: bytes, where: str) -> tuple[str, Mapping[str, Fields]]:
-    """Name of the outermost message, and the fields of each message by its name. Raises
-    ProfileError; ModuleNotFoundError without rosbags."""
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg
-    from rosbags.typesys.base import TypesysError
-
-    full = name if "/msg/" in name else name.replace("/", "/msg/", 1)
-    try:
-        text = definition.decode()
-        if language == "ros2idl":
-            parts = filter(str.strip, _IDL_PARTS.split(text))
-            parsed = {n: fields for part in parts for n, fields in get_types_from_idl(part).items()}
-        else:
-            parsed = dict(get_types_from_msg(text, full))
-    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, KeyError, AssertionError) as e:
-        raise ProfileError(f"{where}: the definition of '{name}' ({language}) cannot be read") from e
-    if full not in parsed:
-        raise ProfileError(f"{where}: the definition of '{name}' does not hold it")
-    return full, {str(n): [(f, _described(d)) for f, d in fields] for n, (_, fields) in parsed.items()}
-
-
-def _described(desc: Any) -> Described:
-    kind = desc[0].name
-    if kind == "BASE":
-        return "base", str(desc[1][0])
-    if kind == "NAME":
-        return "message", str(desc[1])
-    element, length = desc[1]
-    return ("array", (_described(element), int(length))) if kind == "ARRAY" else ("sequence", _described(element))
-
-
 _FORMATS = {
     "bool": "?", "byte": "B", "octet": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
@@ -138,7 +96,8 @@ _Requested = dict[str, Any]  # by field: the index of its number among the reque
 
 class CdrReader:
     """Reads the fields at ``paths`` of messages ``outermost``. The constructor raises
-    ProfileError if a path leads to no number."""
+    ProfileError if a path leads to no number, or if a line of the definition up to the
+    last of them cannot be read."""
 
     def __init__(self, outermost: str, types: Mapping[str, Fields], paths: Sequence[Sequence[str]], where: str) -> None:
         self._types, self._outermost = types, outermost
@@ -150,6 +109,7 @@ class CdrReader:
             for part in path[:-1]:
                 at = at.setdefault(part, {})
             at[path[-1]] = place
+        _Definition(types, self._count, where).walk(("message", outermost), self._requested)
 
     def read(self, data: bytes) -> list[float]:
         """The numbers at the paths. Raises ValueError if the message does not match its
@@ -166,12 +126,54 @@ class CdrReader:
         return walk.found
 
 
+class _Definition:
+    """One pass through the definition, as `_Walk` goes through a message. All types up
+    to the last requested number have to be known."""
+
+    def __init__(self, types: Mapping[str, Fields], left: int, where: str) -> None:
+        self._types, self._left, self._where = types, left, where
+        self._skipped: set[str] = set()  # messages without a requested number; each is looked at once
+
+    def walk(self, described: Described, requested: Any) -> None:
+        """Raises ProfileError."""
+        kind, detail = described
+        if not self._left:
+            return
+        if kind == "unread":
+            raise ProfileError(_unread(self._where, detail))
+        if kind == "base":
+            self._left -= isinstance(requested, int)
+        elif kind == "message":
+            if not isinstance(requested, dict):
+                if detail in self._skipped:
+                    return
+                self._skipped.add(detail)
+            if detail not in self._types:
+                raise ProfileError(f"{self._where}: their definition lacks that of '{clipped(detail)}'")
+            for name, inner in self._types[detail]:
+                self.walk(inner, requested.get(name) if isinstance(requested, dict) else None)
+        else:
+            within = requested if isinstance(requested, dict) else {}
+            self._elements(detail[0] if kind == "array" else detail, within)
+
+    def _elements(self, element: Described, requested: _Requested) -> None:
+        for inner in requested.values() or (None,):
+            self.walk(element, inner)
+
+
+def _unread(where: str, line: tuple[int, str]) -> str:
+    return (
+        f"{where}: line {line[0]} of their definition cannot be read, and the profile's fields stand in it or behind "
+        f"it: '{clipped(line[1])}'; correct it in the package, or log the topic as JSON or Protobuf"
+    )
+
+
 def members(types: Mapping[str, Fields], outermost: str, path: Sequence[str]) -> set[str]:
     """Names of the fields of the message at ``path``; none if no message is there."""
     at: Described = ("message", outermost)
     for part in path:
         at = dict(types.get(at[1], ())).get(part, ("none", "")) if at[0] == "message" else ("none", "")
-    return {name for name, _ in types.get(at[1], ())} if at[0] == "message" else set()
+    return {name for name, _ in types.get(at[1], ()) if name} if at[0] == "message" else set()
 
 
 def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], where: str) -> None:
@@ -180,6 +182,11 @@ def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], whe
         kind, detail = at
         if kind == "message":
             fields = dict(types.get(detail, ()))
+            unread = fields.pop("", None)
+            if part not in fields and unread is not None:
+                raise ProfileError(_unread(where, unread[1]))
+            if part not in fields and detail not in types:
+                raise ProfileError(f"{where}: their definition lacks that of '{clipped(detail)}'")
             if part not in fields:
                 inside = f" in '{'.'.join(path[:place])}'" if place else ""
                 raise ProfileError(f"{where}: no field '{part}'{inside}{nearest(part, fields)}")
@@ -188,8 +195,12 @@ def _number(types: Mapping[str, Fields], at: Described, path: Sequence[str], whe
             at = detail[0] if kind == "array" else detail
             if kind == "array" and int(part) >= detail[1]:
                 raise ProfileError(f"{where}: '{'.'.join(path)}' is beyond the array's {detail[1]} elements")
+        elif kind == "unread":
+            raise ProfileError(_unread(where, detail))
         else:
             raise ProfileError(f"{where}: '{'.'.join(path[:place])}' has no field '{part}'")
+    if at[0] == "unread":
+        raise ProfileError(_unread(where, at[1]))
     if at[0] != "base" or at[1] not in _FORMATS:
         raise ProfileError(f"{where}: '{'.'.join(path)}' is no number")
 
@@ -272,7 +283,7 @@ Read = Callable[[bytes], tuple[list[float], int | None]]
 
 def reader(schema: MessageSchema, paths: Sequence[str], time: str | None, where: str) -> Read:
     """A decoder for the fields at ``paths`` and the time stamp at ``time``. Raises
-    ProfileError; ModuleNotFoundError without rosbags."""
+    ProfileError; ModuleNotFoundError without protobuf for its messages."""
     if len(schema.definition) > DEFINITION_MOST:
         raise ProfileError(f"{where}: a definition of more than {DEFINITION_MOST} bytes")
     split = [path.split(".") for path in paths]
@@ -289,7 +300,7 @@ def reader(schema: MessageSchema, paths: Sequence[str], time: str | None, where:
 
 
 def _cdr(schema: MessageSchema, paths: list[list[str]], stamp: list[str] | None, where: str) -> Read:
-    outermost, types = message_types(schema.name, schema.language, schema.definition, where)
+    outermost, types = message_types(schema.name, schema.language, schema.definition)
     # The stamp is a message with seconds and nanoseconds, or one number.
     inside = members(types, outermost, stamp) if stamp else set()
     parts = [p for names in (SECONDS, NANOSECONDS) for p in names if p in inside][:2]

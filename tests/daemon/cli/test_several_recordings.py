@@ -109,7 +109,7 @@ def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -
     ("arguments", "left"),
     [
         (["diagnose", "a.csv", "--odd", "b.csv"], "--odd b.csv"),
-        (["fit", "a.csv", "--json", "b.csv"], "b.csv"),
+        (["provision", "a.json", "b.toml", "c.toml"], "c.toml"),
         (["fit", "a.csv", "--sgn=+,-,+"], "--sgn=+,-,+; did you mean --sign?"),
     ],
 )
@@ -117,6 +117,11 @@ def test_what_no_command_knows_is_told(triaxcal: Run, arguments: list[str], left
     done = triaxcal(*arguments)
     done.failed(2)
     assert done.err == f"triaxcal {arguments[0]}: unrecognized arguments: {left}\n"
+
+
+@pytest.mark.parametrize("arguments", [["fit", "a.csv", "--json", "b.csv"], ["verify", "cal.json", "a.csv", "b.csv"]])
+def test_a_second_recording_points_to_the_command_that_takes_several(triaxcal: Run, arguments: list[str]) -> None:
+    triaxcal(*arguments).failed(2, "b.csv", "one recording", "triaxcal diagnose")
 
 
 @pytest.mark.slow

@@ -58,6 +58,20 @@ def test_an_index_that_counts_no_samples_is_not_said_to(tmp_path: Path) -> None:
     assert read(tmp_path, content, Reading(rate=100.0)).remarks[0].startswith("read as t = rows, 100 Hz")
 
 
+@pytest.mark.parametrize("column", ["time", "Datum", "when"])
+@pytest.mark.parametrize(
+    "form",
+    ["Do 16. Mai 2024 18:16:{:06.3f}", "16.05.2024 18.16.{:06.3f}", "18h16m{:06.3f}", "20240516T1816{:06.3f}",
+     "06:16:{:06.3f} nachm."],
+)  # fmt: skip
+def test_a_date_that_is_not_understood_is_quoted(tmp_path: Path, column: str, form: str) -> None:
+    content = lines([f"{form.format(i / 100)},1,2,{i % 3}" for i in range(40)], f"{column},ax,ay,az")
+    told = asked(tmp_path, content)
+    assert f"'{form.format(0)}'" in told
+    assert "not understood" in told
+    assert len(read(tmp_path, content, Reading(rate=100.0)).samples.time_ns) == 40
+
+
 def test_t_alone_is_a_time_where_it_rises_and_else_a_temperature(tmp_path: Path) -> None:
     rising = lines([f"{i / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
     assert set(np.diff(read(tmp_path, rising).samples.time_ns)) == {10_000_000}

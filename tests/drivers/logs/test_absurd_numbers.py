@@ -14,13 +14,11 @@ from triaxcal_drivers.logs import asc, blf, candump, pcap, trc
 from triaxcal_drivers.logs.can_frames import (
     EXTENDED_MOST,
     FD_MOST,
-    LONGEST_NS,
     LoggedFrame,
     Remark,
-    date_ns,
-    utc_ns,
     whole,
 )
+from triaxcal_drivers.logs.dates import LONGEST_NS, date_ns, utc_ns
 from triaxcal_drivers.logs.mf4 import _times_ns
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
@@ -118,10 +116,11 @@ def test_an_identifier_is_digits(read: Read, identifier: bytes) -> None:
 
 
 @pytest.mark.parametrize("start", [b"NaN", b"Infinity", b"1E999999", b"-3", b"999999"])
-def test_a_start_that_is_no_day_is_no_date(read: Read, start: bytes) -> None:
+def test_a_start_that_is_no_day_is_not_understood(read: Read, start: bytes) -> None:
     found, account = read(trc.frames, TRC.replace(b"46348.9", start))
     assert found[0].time_ns == 1_000_000
-    assert account.remarks == {Remark.NO_DATE}
+    assert account.remarks == {Remark.DATE_NOT_UNDERSTOOD}
+    assert account.unread_date.endswith(f": '{start.decode()}'")
 
 
 def test_a_date_that_is_in_no_calendar_is_none() -> None:

@@ -10,6 +10,7 @@ import pytest
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.asc import frames
 from triaxcal_drivers.logs.can_frames import LoggedFrame, Remark
+from triaxcal_drivers.logs.dates import date_ns, utc_ns
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
 HEAD = "date Sat Sep 30 10:06:13.191 pm 2017\nbase hex  timestamps absolute\ninternal events logged\n// version 9.0.0\n"
@@ -106,6 +107,99 @@ def test_without_a_date_times_count_from_zero(read: Read) -> None:
 def test_a_german_date_is_one(read: Read) -> None:
     (frame,), _ = read(frames, "date Die M\xe4r 10 15:00:00 2020\n 0.5 1 1 Rx d 0\n".encode("cp1252"))
     assert frame.time_ns == 1_583_852_400_500_000_000
+
+
+EVENING_NS = 1_715_883_410_884_000_000  # 2024-05-16 18:16:50.884 UTC
+
+
+@pytest.mark.parametrize(
+    "date",
+    [
+        "Thu May 16 06:16:50.884 pm 2024",
+        "Thu May 16 06:16:50.884 PM 2024",
+        "Thu May 16 18:16:50.884 2024",
+        "Do Mai 16 06:16:50.884 nachm. 2024",
+        "Do. Mai 16 18:16:50.884 2024",
+        "Donnerstag Mai 16 18:16:50.884 2024",
+        "Thu 16 May 2024 06:16:50.884 p.m.",
+        "jeu. mai 16 18:16:50.884  2024",
+        "jue may. 16 06:16:50.884 p. m. 2024",
+        "gio mag 16 18:16:50.884 2024",
+        "qui mai 16 18:16:50.884 2024",
+        "do mei 16 06:16:50.884 p.m. 2024",
+        "tor maj 16 06:16:50.884 em 2024",
+        "czw maj 16 18:16:50.884 2024",
+        "čt kvě 16 06:16:50.884 odp. 2024",
+        "Per May 16 06:16:50.884 ÖS 2024",
+        "to touko 16 06:16:50.884 ip. 2024",
+        "Чт май 16 18:16:50.884 2024",
+        "周四 5月 16 06:16:50.884 下午 2024",
+        "木 5 16 06:16:50.884 午後 2024",
+        "목 5월 16 06:16:50.884 오후 2024",
+        "2024-05-16 18:16:50.884",
+        "2024-05-16T18:16:50.884Z",
+        "16.05.2024 18:16:50.884",
+    ],
+)
+def test_dates_in_other_languages(read: Read, date: str) -> None:
+    western = "cp1252" if date.encode("cp1252", "ignore").decode("cp1252") == date else "utf-8"
+    for encoding in ("utf-8", western):
+        head = f"date {date}\nbase hex  timestamps absolute\n".encode(encoding)
+        (frame,), account = read(frames, head + b" 0.5 1 1 Rx d 0\n")
+        assert frame.time_ns == EVENING_NS + 500_000_000
+        assert account.remarks == {Remark.DATE_WITHOUT_ZONE}
+
+
+@pytest.mark.parametrize(
+    ("months", "number"),
+    [
+        ("Jan Januar janv. enero ene gennaio styczeń leden Ocak tammikuuta", 1),
+        ("Feb févr. fev febbraio luty únor Şub helmi", 2),
+        ("Mär Mrz März mars marzo mrt maart březen maalis", 3),
+        ("June Juni juin giu czerwiec červen čvn Haziran kesä", 6),
+        ("July juil. juillet lug lipiec červenec čvc Tem heinä", 7),
+        ("août ago Ağu srpen sierpień elo", 8),
+        ("Okt Oct ott out paź říj Ekim loka", 10),
+        ("Dez déc. dic gru prosinec Aralık joulu des", 12),
+    ],
+)
+def test_months_in_other_languages(months: str, number: int) -> None:
+    for month in months.split():
+        assert date_ns(f"xx {month} 10 15:00:00 2020") == utc_ns(2020, number, 10, 15, 0, 0), month
+
+
+@pytest.mark.parametrize(
+    "date",
+    [
+        "Thu Foo 16 06:16:50.884 pm 2024",
+        "Thu May 16 06:16:50.884 xx 2024",
+        "Thu May 32 06:16:50.884 pm 2024",
+        "5/6/2024 6:16:50",
+        "soon",
+    ],
+)
+def test_a_date_that_is_not_understood_is_told_with_its_line(read: Read, date: str) -> None:
+    lines = f"base hex  timestamps absolute\ndate {date}\n 0.5 1 1 Rx d 0\n"
+    (frame,), account = read(frames, lines.encode())
+    assert frame.time_ns == 500_000_000
+    assert account.remarks == {Remark.DATE_NOT_UNDERSTOOD}
+    assert account.unread_date == f"line 2: '{date}'"
+
+
+def test_a_block_with_a_date_that_is_not_understood_goes_on(read: Read) -> None:
+    lines = f"{HEAD}  1.0 1  12D  Rx d 0\nBegin Triggerblock Thu Foo 1 10:00:00 2017\n  1.5 1  12D  Rx d 0\n"
+    found, account = read(frames, lines.encode())
+    assert [(f.time_ns or 0) - START_NS for f in found] == [1_000_000_000, 1_500_000_000]
+    assert account.remarks == {Remark.DATE_NOT_UNDERSTOOD, Remark.DATE_WITHOUT_ZONE}
+
+
+@pytest.mark.parametrize("words", ["Start of measurement", "Start der Messung", "D\xe9but de la mesure", "测量开始"])
+def test_the_start_of_a_measurement_is_no_event_in_any_language(read: Read, words: str) -> None:
+    lines = (
+        f"{HEAD}  0.000000 {words}\n  0.1 1  12D  Rx d 0\n  0.2 CAN 1 Status:chip status error active\n  0.3 Stopp\n"
+    )
+    _, account = read(frames, lines.encode())
+    assert account.others == {"event": 2}
 
 
 @pytest.mark.parametrize(

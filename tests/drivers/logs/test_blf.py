@@ -84,10 +84,10 @@ def test_a_date_tells_no_zone(read: Read) -> None:
 
 
 @pytest.mark.parametrize("start", [(0,) * 8, (2017, 2, 4, 31, 12, 0, 0, 0), (2017, 9, 6, 30, 65535, 0, 0, 0)])
-def test_without_a_date_it_is_said(read: Read, start: tuple[int, ...]) -> None:
+def test_without_a_date_in_the_calendar_it_is_said(read: Read, start: tuple[int, ...]) -> None:
     (frame,), account = read(frames, head(start) + container(thing(1, CLASSIC)))
     assert frame.time_ns == 7
-    assert account.remarks == {Remark.NO_DATE}
+    assert account.remarks == {Remark.DATE_NOT_UNDERSTOOD if any(start) else Remark.NO_DATE}
 
 
 def test_after_damage_in_a_container_the_next_object_is_found(read: Read) -> None:
