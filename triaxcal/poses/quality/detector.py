@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.model.arrivals import RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import faults, mains
 from triaxcal.poses.quality.faults import CellKeeper, Gaps, RunLengths, StepEstimator
@@ -32,11 +33,7 @@ from triaxcal.poses.quality.finding import (
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import (
     OTHERWISE,
-    RATE_LEAST,
-    RATE_S,
-    RATE_SAMPLES,
     Windows,
-    first_period_ns,
     shown_step,
     window_size,
 )
