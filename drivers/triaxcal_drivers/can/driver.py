@@ -67,6 +67,32 @@ class TogetherInTime:
         return bool(self._had)
 
 
+class Arrived:
+    """Times of samples at which they arrived, never back. Samples that arrived
+    together, by one stamp of an adapter or a log for several, are 1 ns apart; one
+    that repeats the sample before it has the same time."""
+
+    def __init__(self, columns: int) -> None:
+        self._stamp_ns = self._latest_ns = -(1 << 62)  # before any
+        self._values = np.full((columns, 1), np.nan)
+
+    def in_order(self, arrival_ns: Ints, values: NDArray[np.float64]) -> Ints:
+        """``arrival_ns`` (n,), ``values`` (columns, n)."""
+        if not len(arrival_ns):
+            return arrival_ns
+        stamp = np.concatenate([[self._stamp_ns], arrival_ns])
+        held = np.concatenate([self._values, values], axis=1)
+        together = np.diff(stamp) == 0
+        other = ~((held[:, 1:] == held[:, :-1]) | (np.isnan(held[:, 1:]) & np.isnan(held[:, :-1]))).all(axis=0)
+        time_ns = np.maximum.accumulate(np.concatenate([[self._latest_ns], arrival_ns]))
+        for at in np.flatnonzero(together).tolist():
+            time_ns[at + 1] = max(int(time_ns[at + 1]), int(time_ns[at]) + int(other[at]))
+        # What comes next by another stamp is later than those that arrived together.
+        time_ns = np.maximum.accumulate(time_ns)
+        self._stamp_ns, self._latest_ns, self._values = int(stamp[-1]), int(time_ns[-1]), held[:, -1:]
+        return np.asarray(time_ns[1:])
+
+
 LATEST = 8
 """A message may come this many samples late; an unfinished sample is waited for
 so long."""
@@ -162,6 +188,7 @@ class CanDecoder:
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
         self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool))
         self._together = TogetherInTime(len(layout.messages), self._period_ns)
+        self._arrived = Arrived(len(self._columns))
         self._senders = self._watched()
 
     def feed(self, batch: RawBatch) -> SampleBlock:
@@ -260,7 +287,7 @@ class CanDecoder:
 
     def _as_they_come(self, parts: _Parts) -> SampleBlock:
         """Without a counter every message is a sample, at host time."""
-        time_ns = np.maximum.accumulate(np.maximum(parts.time_ns, self._last_ns))
+        time_ns = self._arrived.in_order(parts.time_ns, parts.values)
         counter = self._settled + np.arange(len(parts))
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
@@ -277,13 +304,12 @@ class CanDecoder:
         settled = last if self._together.open else last + 1
         self._held = parts[sample >= settled]
         complete = np.bincount(sample)[:settled] == len(self._layout.messages)
-        values = self._rows(parts, sample, last + 1)[:, :settled][:, complete]
-        first = parts.time_ns[np.searchsorted(sample, np.arange(settled))]
-        time_ns = np.maximum.accumulate(np.concatenate([[self._last_ns], first]))[1:]
+        values = self._rows(parts, sample, last + 1)[:, :settled]
+        time_ns = self._arrived.in_order(parts.time_ns[np.searchsorted(sample, np.arange(settled))], values)
         counter = self._settled + np.arange(settled)
         self._settled += settled
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
-        block = self._block(time_ns[complete], counter[complete], values)
+        block = self._block(time_ns[complete], counter[complete], values[:, complete])
         return replace(block, incomplete=settled - int(complete.sum()))
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
