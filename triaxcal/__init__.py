@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from triaxcal.arrays import Floats, Ints
     from triaxcal.documents import Calibration
     from triaxcal.errors import InvalidData, MissingChannel, Refused, TooShort, TriaxcalError
+    from triaxcal.model.arrivals import SampleTimes
     from triaxcal.model.gravity import HEIGHTS_M, local_gravity_g
     from triaxcal.model.samples import Moment, Samples
     from triaxcal.model.sensor import Sensor
@@ -112,6 +113,7 @@ _NAMES = {
         "TooShort",
         "TriaxcalError",
     ),
+    "model.arrivals": ("SampleTimes",),
     "model.gravity": (
         "HEIGHTS_M",
         "local_gravity_g",
@@ -142,6 +144,7 @@ __all__ = [
     "Pose",
     "Poses",
     "Refused",
+    "SampleTimes",
     "Samples",
     "Sensor",
     "Stage",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -40,6 +41,104 @@ def only_finite(block: td.SampleBlock) -> td.SampleBlock:
     return block if finite.all() else replace(block.only(finite), not_finite=int((~finite).sum()))
 
 
+# The rate at which a unit samples, against the declared one.
+
+OFF = 0.1
+"""A rate that differs by a larger share is not the declared one: oscillators are off by
+a hundredth at most."""
+FASTER = 4.0
+"""A unit that is so many times as fast as declared is simulated, faster than life."""
+SILENCE_S, SILENCE_PERIODS = 1.0, 10
+"""Longer steps in time, and in declared periods, are interruptions and no part of the
+rate."""
+RATE_LEAST, RATE_LEAST_S = 50, 2.0
+"""Samples, and seconds, from which a rate is judged."""
+BINS = 100
+"""Bins of steps in a factor e: a median to a percent."""
+
+
+@dataclass
+class SampleRate:
+    """The real rate of a stream of ``declared_hz``, whatever its times are of.
+
+    Times by a counter go on at the declared rate; then the host's clock tells the real
+    one. Times by stamps, or of arrival, tell it themselves: by all samples over all
+    time and by the median step, of which lost samples change the first alone.
+    """
+
+    declared_hz: float
+    _samples: int = 0
+    """Counter steps in ``_own_ns`` of the stream's own time."""
+    _own_ns: int = 0
+    _host_ns: int = 0
+    _longest_ns: int = 0
+    """Longest step of the host's time that is no silence."""
+    _last: tuple[int, int] | None = None
+    """Counter and time of the last sample."""
+    _last_host_ns: int | None = None
+    _last_laid_ns: int | None = None
+    _times: tc.SampleTimes = field(default_factory=lambda: tc.SampleTimes())
+    _steps: Counter[int] = field(default_factory=Counter)
+
+    @property
+    def _silence_ns(self) -> float:
+        return max(SILENCE_S, SILENCE_PERIODS / self.declared_hz) * 1e9
+
+    def received(self, host_ns: NDArray[np.int64]) -> None:
+        """Host times (n,) of raw records."""
+        if not len(host_ns):
+            return
+        step = np.diff(host_ns, prepend=host_ns[0] if self._last_host_ns is None else self._last_host_ns)
+        step = step[(step > 0) & (step <= self._silence_ns)]
+        self._host_ns += int(step.sum())
+        self._longest_ns = max(self._longest_ns, int(step.max(initial=0)))
+        self._last_host_ns = int(host_ns[-1])
+
+    def decoded(self, counter: NDArray[np.int64], time_ns: NDArray[np.int64]) -> None:
+        """Samples (n,) whose times rise."""
+        if not len(time_ns):
+            return
+        counter_before, before_ns = self._last or (int(counter[0]), int(time_ns[0]))
+        step = np.diff(time_ns, prepend=before_ns)
+        near = step <= self._silence_ns
+        self._own_ns += int(step[near].sum())
+        self._samples += int(np.diff(counter, prepend=counter_before)[near].sum())
+        self._last = int(counter[-1]), int(time_ns[-1])
+        self._laid(self._times.feed(time_ns))
+
+    def _laid(self, time_ns: NDArray[np.int64]) -> None:
+        if not len(time_ns):
+            return
+        step = np.diff(time_ns, prepend=time_ns[0] if self._last_laid_ns is None else self._last_laid_ns)
+        self._last_laid_ns = int(time_ns[-1])
+        bins, count = np.unique(np.rint(np.log(step[step > 0]) * BINS).astype(int), return_counts=True)
+        self._steps.update(dict(zip(bins.tolist(), count.tolist(), strict=True)))
+
+    @property
+    def bursts(self) -> Any:
+        """As of `tc.SampleTimes.bursts`."""
+        return self._times.bursts()
+
+    def wrong_hz(self) -> float | None:
+        """The real rate, where it is not the declared one."""
+        if self._samples < RATE_LEAST or min(self._own_ns, self._host_ns) < RATE_LEAST_S * 1e9:
+            return None
+        if abs(self._own_ns / self._host_ns - 1) > OFF:  # the host's clock tells
+            rate_hz = self._samples / self._host_ns * 1e9
+        else:
+            both = (self._samples / self._own_ns * 1e9, 1e9 / self._median_step_ns())
+            rate_hz = min(both, key=lambda hz: abs(np.log(hz / self.declared_hz)))
+        # The first and the last burst may have more samples than time, or fewer.
+        allowed = 1 + OFF + self._longest_ns / self._host_ns
+        off = rate_hz / self.declared_hz
+        return None if 1 / allowed <= off <= allowed or off > FASTER else rate_hz
+
+    def _median_step_ns(self) -> float:
+        bins = sorted(self._steps)
+        passed = np.cumsum([self._steps[b] for b in bins])
+        return float(np.exp(bins[int(np.searchsorted(passed, passed[-1] / 2))] / BINS))
+
+
 @dataclass
 class DecodedStream:
     """One stream of one unit, decoded; counts whatever does not come through.
@@ -55,6 +154,8 @@ class DecodedStream:
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
         self._host_span_ns: tuple[int, int] | None = None
+        self._rate = SampleRate(self.bundle.profile.sampling.rate_hz)
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self.two_senders = False
         """Whether records of two units were among those that came."""
 
@@ -77,12 +178,32 @@ class DecodedStream:
 
     def checkpoint(self) -> tuple[Counter[str], tuple[Any, ...]]:
         """What it has come to so far, for `roll_back`."""
-        return self.counts.copy(), (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns)
+        kept = deepcopy((self._rate, self._low, self._high))
+        return self.counts.copy(), (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns, kept)
 
     def roll_back(self, checkpoint: tuple[Counter[str], tuple[Any, ...]]) -> None:
         """As if nothing had come since. No more records may be fed."""
-        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = checkpoint
+        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns, kept) = checkpoint
         self.counts = counts.copy()
+        self._rate, self._low, self._high = deepcopy(kept)
+
+    def wrong_rate(self) -> str:
+        """The real rate beside the declared one, in words; empty where they are the
+        same."""
+        if (rate_hz := self._rate.wrong_hz()) is None:
+            return ""
+        declared = tc.number_format.plain(self._rate.declared_hz, 6)
+        return f"{rate_hz:.3g} Hz, and sampling.rate_hz of the profile is {declared}"
+
+    def faults(self) -> list[str]:
+        """What shows in the samples of a mere recording, one line of data quality
+        each. The metrology is loaded only where there is anything to say of them."""
+        found = [f"rate: {rate}"] if (rate := self.wrong_rate()) else []
+        if (bursts := self._rate.bursts) is not None:
+            found.append(tc.text.quality_line(tc.poses.Bursts(bursts.samples, bursts.period_s)))
+        if self.counts["samples"] >= RATE_LEAST and (dead := np.flatnonzero(self._low == self._high)).size:
+            found.append(tc.text.quality_line(tc.poses.StuckOutput(tuple("xyz"[i] for i in dead), None, ())))
+        return found
 
     def feed(self, batch: td.RawBatch) -> td.SampleBlock:
         """Takes raw records; gives the samples that they complete."""
@@ -98,6 +219,7 @@ class DecodedStream:
         if self._first_host_ns is None and len(batch):
             self._first_host_ns = int(batch.time_ns[0])
         self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & td.RawFlag.LOST_BEFORE))
+        self._rate.received(batch.time_ns)
         block = only_finite(self._decoder.feed(batch))
         self.two_senders = self.two_senders or block.two_senders
         for name in _PASSED_ON:
@@ -116,6 +238,9 @@ class DecodedStream:
             self.counts["out_of_order"] += int((~fresh).sum())
             self.counts["samples"] += int(fresh.sum())
             self._last_ns = max(int(block.time_ns.max()), self._last_ns or -(2**62))
+            self._rate.decoded(block.counter[fresh], block.time_ns[fresh])
+            self._low = np.minimum(self._low, block.readings[fresh].min(axis=0, initial=np.inf))
+            self._high = np.maximum(self._high, block.readings[fresh].max(axis=0, initial=-np.inf))
             self._take(block, fresh)
         return block, fresh
 

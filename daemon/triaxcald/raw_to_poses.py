@@ -85,6 +85,8 @@ class Pipeline(DecodedStream):
         elif self.counts["receiver_overflows"]:
             times = self.counts["receiver_overflows"]
             found["missing_samples"] = f"the stream was interrupted {'once' if times == 1 else f'{times} times'}"
+        if rate := self.wrong_rate():
+            found["rate"] = rate
         if self.counts["duplicates"]:
             found["duplicate_samples"] = str(self.counts["duplicates"])
         if self.counts["malformed"]:

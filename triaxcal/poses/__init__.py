@@ -7,6 +7,7 @@ from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, SIGNIFICANT
 from triaxcal.poses.finder import PoseFinder
 from triaxcal.poses.pose import Pose, Run, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import QualityFinding, disturbances
+from triaxcal.poses.quality.finding import Bursts, StuckOutput
 from triaxcal.poses.stillness.detector import TURN_S, find_spans
 from triaxcal.poses.stillness.windows import Windows
 
@@ -15,12 +16,14 @@ __all__ = [
     "READING_MOST",
     "SIGNIFICANT",
     "TURN_S",
+    "Bursts",
     "InStream",
     "Pose",
     "PoseFinder",
     "QualityFinding",
     "Run",
     "StillSpan",
+    "StuckOutput",
     "Windows",
     "channels_of",
     "disturbances",

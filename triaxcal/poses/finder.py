@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData, TooShort
+from triaxcal.model.arrivals import SampleTimes
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import QualityDetector, QualityFinding, faulty_poses
+from triaxcal.poses.quality.finding import Bursts
 from triaxcal.poses.stillness.detector import Span, StillnessDetector
-from triaxcal.poses.stillness.windows import Windows
+from triaxcal.poses.stillness.windows import Windows, require_finite
 
 
 class PoseFinder:
-    """Finds the still poses of a stream, and faults of its samples.
+    """Finds the still poses of a stream, and faults of its samples. Samples that came
+    in bursts are laid at the times at which they were taken
+    (`triaxcal.model.arrivals`).
 
     The blocks may have any size: the result is that of the whole. ``turn_s`` is the
     shortest duration of an in-place rotation, where the unit may turn so, as in
@@ -22,6 +29,8 @@ class PoseFinder:
 
     def __init__(self, turn_s: float | None = None) -> None:
         self._turn_s = turn_s
+        self._times = SampleTimes()
+        self._held: tuple[Floats, dict[str, Floats]] | None = None
         self._stillness = StillnessDetector()
         self._quality = QualityDetector()
         self._spans: tuple[int, list[Span]] = (0, [])
@@ -32,11 +41,29 @@ class PoseFinder:
         (n,) by name. Raises InvalidData for other shapes, times that do not increase,
         or readings that are not finite."""
         self._findings = None
-        self._stillness.feed(time_ns, readings, channels or {})
-        self._quality.feed(time_ns, readings)
+        if not len(time_ns):
+            return
+        require_finite(time_ns, readings)
+        held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
+        if self._held is not None and len(self._held[0]):
+            readings = np.concatenate([self._held[0], readings])
+            held = {name: np.concatenate([v, held[name]]) for name, v in self._held[1].items()}
+        self._held = np.asarray(readings, dtype=float), held
+        self._take(self._times.feed(time_ns))
+
+    def _take(self, time_ns: Ints) -> None:
+        """The next samples, as many as have times."""
+        if self._held is None or not len(time_ns):
+            return
+        n, (readings, channels) = len(time_ns), self._held
+        self._held = readings[n:], {name: v[n:] for name, v in channels.items()}
+        self._stillness.feed(time_ns, readings[:n], {name: v[:n] for name, v in channels.items()})
+        self._quality.feed(time_ns, readings[:n])
 
     def finish(self) -> None:
         """End of the stream."""
+        self._findings = None
+        self._take(self._times.finish())
         self._stillness.finish()
         self._quality.finish()
 
@@ -82,4 +109,6 @@ class PoseFinder:
         """Faults of the samples so far, cached."""
         if self._findings is None:
             self._findings = self._quality.findings(self.windows, self.spans())
+            if (bursts := self._times.bursts()) is not None:
+                self._findings.append(Bursts(bursts.samples, bursts.period_s))
         return self._findings

@@ -65,6 +65,11 @@ def _(found: of.MissingSamples, unit: str = "") -> str:
 
 
 @quality.register
+def _(found: of.Bursts, unit: str = "") -> str:
+    return f"{number_of(found.samples, 'sample')} every {found.period_s * 1e3:.0f} ms, taken for evenly spaced"
+
+
+@quality.register
 def _(found: of.DuplicateSamples, unit: str = "") -> str:
     return f"{found.repeated} of {found.samples} samples repeat the one before on all axes"
 

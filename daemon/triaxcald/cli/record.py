@@ -315,13 +315,16 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
         counts = {name: n for name, n in kept.counts.items() if n}
         path = str(kept.path) if kept.path else None
         asked_to = kept.error is None or kept.exit_code == INTERRUPTED
-        level = "error" if not asked_to else "warning" if kept.lost else "info"
-        told = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
+        level = "error" if not asked_to else "warning" if kept.lost or kept.data_quality else "info"
+        told: dict[str, Any] = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
         told |= {"unconfirmed": kept.unconfirmed} if kept.unconfirmed else {}
+        told |= {"data_quality": list(kept.data_quality)} if kept.data_quality else {}
         progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return
     if kept.path is not None:
         say(_summary(kept))
+        for line in kept.data_quality:
+            say(f"warning: {kept.kind} {kept.unit}: {line}")
     if kept.error is not None:
         _show(kept.trace)
         say(f"triaxcal: {kept.error}")

@@ -12,7 +12,7 @@ from typing import Any
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.decoded import only_finite
+from triaxcald.decoded import DecodedStream, only_finite
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
 from triaxcald.inputs import CALIBRATION, PROFILE
@@ -134,7 +134,11 @@ class Importing:
         self.counts = dict.fromkeys(("samples", *COUNTED), 0)
         self.times = Times(1e9 / bundle.profile.sampling.rate_hz)
         self._writer = writer
-        self._decoders: dict[str, td.Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
+        self.readings = DecodedStream(bundle, td.READINGS)
+        self._decoders: dict[str, td.Decoder] = {
+            name: self.readings if name == td.READINGS else driver.decoder(bundle, name)
+            for name in bundle.profile.streams
+        }
         self._batches = 0
         self.two_senders = False
         """Whether two units send on the readings' stream."""
@@ -224,6 +228,7 @@ def _write(
         detail = {
             **file_told(source),
             **describe(importing),
+            "data_quality": importing.readings.faults(),
             "samples": importing.counts,
             "imported": iso_time(time.time_ns(), "seconds"),
         }
@@ -337,6 +342,7 @@ def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
         )
     if off := _off(detail, seconds):
         lines.append(off)
+    lines += detail.get("data_quality", [])
     if times["pauses"]:
         lines.append(
             f"{tc.number_format.number_of(times['pauses'], 'pause')}, the longest of {times['longest_pause_s']:.6g} s"

@@ -146,6 +146,8 @@ QUALITY = {
     "saturation": "Readings at the end of the range",
     "stuck_output": "Output frozen",
     "missing_samples": "Samples missing",
+    "rate": "Sample rate not the declared one",
+    "bursts": "Samples in bursts",
     "duplicate_samples": "Samples that came twice",
     "out_of_order_samples": "Samples out of order",
     "bus_errors": "Errors on the bus",
@@ -157,6 +159,8 @@ QUALITY = {
     "creeping_pose": "Outputs creep while the pose is held",
     "unknown_noise": "Noise of the pose means not known",
 }
+WORDS = {"rate", "bursts"}
+"""Names that are words too: only before their colon they are names."""
 _NAME = re.compile(
     rf"\b(?:(?:{tc.effects.BIAS}|{tc.effects.SCALE_FACTOR})[^\s,;]+?(?=[:,;.]?(?:\s|$))|"
     + "|".join(
@@ -165,7 +169,7 @@ _NAME = re.compile(
                 *(e.name for e in tc.effects.OWN),
                 tc.effects.BIAS.rstrip(":"),
                 tc.effects.SCALE_FACTOR.rstrip(":"),
-                *QUALITY,
+                *(QUALITY.keys() - WORDS),
             ),
             key=len,
             reverse=True,

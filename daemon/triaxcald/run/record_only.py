@@ -61,6 +61,7 @@ class Kept:
     trace: str | None = None
     host_seconds: float | None = None
     unconfirmed: int = 0
+    data_quality: tuple[str, ...] = ()
 
 
 class State(Enum):
@@ -152,6 +153,11 @@ class AtRecording(ABC):
     def _latest(self) -> dict[str, float]:
         return {}
 
+    @property
+    def _data_quality(self) -> tuple[str, ...]:
+        """As of `Kept`."""
+        return ()
+
     @abstractmethod
     async def _work(self, seconds: float | None, policy: RetryPolicy) -> None:
         """The work of `run`, which may raise."""
@@ -162,6 +168,7 @@ class AtRecording(ABC):
         return Kept(
             self.name, self._path, self._counts, self._seconds, records.gaps, records.gaps_s, self._lost,
             kind=self.kind, host_seconds=self._host_seconds, unconfirmed=self._unconfirmed,
+            data_quality=self._data_quality,
         )  # fmt: skip
 
     def leave(self) -> None:
@@ -454,6 +461,10 @@ class UnitRecording(AtRecording):
     @property
     def _host_seconds(self) -> float | None:
         return self._recorded.streams[td.READINGS].host_seconds
+
+    @property
+    def _data_quality(self) -> tuple[str, ...]:
+        return tuple(self._recorded.streams[td.READINGS].faults())
 
     @property
     def _latest(self) -> dict[str, float]:

@@ -435,10 +435,16 @@ class UnitRun(UnitSession):
             error=error,
             wanted=ending.wanted,
             lost=self._lost,
-            data_quality=tuple(self._acquisition.pipelines[td.READINGS].data_quality())
-            if self._acquisition and ending.exit_code == REFUSED
-            else (),
+            data_quality=self._possible_causes() if ending.exit_code == REFUSED else (),
         )
+
+    def _possible_causes(self) -> tuple[str, ...]:
+        """Faults of all readings that came, where these were refused."""
+        if self._acquisition is None:
+            return ()
+        pipeline = self._acquisition.pipelines[td.READINGS]
+        pipeline.close()
+        return tuple(pipeline.data_quality())
 
     def _require_readable_journal(self, identity: IdentityRead) -> None:
         """Check the journals before any pose is taken. Raises InputError."""

@@ -109,6 +109,34 @@ class TogetherFromBegin:
 _EXACT = (1 << 52) - 1
 """What a float holds of a whole number, of which a longer time stamp keeps so many
 bits: it wraps earlier."""
+
+
+class Arrived:
+    """Times of samples at which they arrived, never back. Samples that arrived
+    together, by one stamp of an adapter or a log for several, are 1 ns apart; one
+    that repeats the sample before it has the same time."""
+
+    def __init__(self, columns: int) -> None:
+        self._stamp_ns = self._latest_ns = -(1 << 62)  # before any
+        self._values = np.full((columns, 1), np.nan)
+
+    def in_order(self, arrival_ns: Ints, values: NDArray[np.float64]) -> Ints:
+        """``arrival_ns`` (n,), ``values`` (columns, n)."""
+        if not len(arrival_ns):
+            return arrival_ns
+        stamp = np.concatenate([[self._stamp_ns], arrival_ns])
+        held = np.concatenate([self._values, values], axis=1)
+        together = np.diff(stamp) == 0
+        other = ~((held[:, 1:] == held[:, :-1]) | (np.isnan(held[:, 1:]) & np.isnan(held[:, :-1]))).all(axis=0)
+        time_ns = np.maximum.accumulate(np.concatenate([[self._latest_ns], arrival_ns]))
+        for at in np.flatnonzero(together).tolist():
+            time_ns[at + 1] = max(int(time_ns[at + 1]), int(time_ns[at]) + int(other[at]))
+        # What comes next by another stamp is later than those that arrived together.
+        time_ns = np.maximum.accumulate(time_ns)
+        self._stamp_ns, self._latest_ns, self._values = int(stamp[-1]), int(time_ns[-1]), held[:, -1:]
+        return np.asarray(time_ns[1:])
+
+
 LATEST = 8
 """A message may come this many samples late; an unfinished sample is waited for
 so long."""
@@ -286,6 +314,7 @@ class CanDecoder:
         self._timeline = _timeline(layout, self._period_ns)
         self._placed_ns = 0  # host time of the last sample that it placed
         self._order = 0  # records of the stream so far
+        self._arrived = Arrived(len(self._columns))
         self._senders = self._watched()
 
     def feed(self, batch: RawBatch) -> SampleBlock:
@@ -403,7 +432,7 @@ class CanDecoder:
 
     def _as_they_come(self, parts: _Parts) -> SampleBlock:
         """Without a counter every message is a sample, at host time."""
-        time_ns = np.maximum.accumulate(np.maximum(parts.time_ns, self._last_ns))
+        time_ns = self._arrived.in_order(parts.time_ns, parts.values)
         counter = self._settled + np.arange(len(parts))
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
@@ -419,14 +448,13 @@ class CanDecoder:
         settled = last if self._together.open else last + 1
         self._held = parts[sample >= settled]
         complete = np.bincount(sample, minlength=settled)[:settled] == self._layout.sample
-        values = self._rows(parts, sample, last + 1)[:, :settled][:, complete]
-        first = parts.time_ns[np.searchsorted(sample, np.arange(settled))]
-        time_ns = np.maximum.accumulate(np.concatenate([[self._last_ns], first]))[1:]
+        values = self._rows(parts, sample, last + 1)[:, :settled]
+        time_ns = self._arrived.in_order(parts.time_ns[np.searchsorted(sample, np.arange(settled))], values)
         counter = self._settled + np.arange(settled)
         self._settled += settled
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
         firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)[complete]
-        block = self._block(time_ns[complete], counter[complete], values, firsts)
+        block = self._block(time_ns[complete], counter[complete], values[:, complete], firsts)
         return replace(block, incomplete=block.incomplete + settled - int(complete.sum()))
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:

@@ -75,6 +75,25 @@ def test_messages_within_half_a_period_are_one_sample(cuts: Sequence[int]) -> No
     assert sum(b.invalid for b in blocks) == 1
 
 
+@pytest.mark.parametrize("cuts", [(), (3,), (5, 6), tuple(range(1, 9))])
+@pytest.mark.parametrize("parts", [1, 2])
+def test_samples_of_one_stamp_are_all_taken_and_repeats_of_one_are_not(parts: int, cuts: Sequence[int]) -> None:
+    """As of an adapter that stamps a packet of messages, and of a log with every message twice."""
+    one = Message("M", 0x10, {**XY.signals, "uz": Signal("uz", 24, 8)})
+    single = Layout((one,), {n: (0, one.signals[n]) for n in ("ux", "uy", "uz")}, (), {}, ())
+    x = [1, 2, 3, 3, 4, 5]
+    stamps = [0, 0, 0, 0, 20 * MS, 20 * MS]
+    if parts == 1:
+        records = [(at, 0x10, 0, bytes([v, v, 1, v])) for at, v in zip(stamps, x, strict=True)]
+        blocks = decoded(single, records, [c for c in cuts if c < len(records)])
+    else:
+        records = [m for at, v in zip(stamps, x, strict=True) for m in (xy(at, v), z(at, 100 + v))]
+        blocks = decoded(together((1,)), records, cuts)
+    assert np.concatenate([b.readings[:, 0] for b in blocks]).tolist() == x
+    times = np.concatenate([b.time_ns for b in blocks])
+    assert times.tolist() == [0, 1, 2, 2, 20 * MS, 20 * MS + 1]
+
+
 def test_a_message_that_comes_again_begins_the_next_sample() -> None:
     (block,) = decoded(together((1,)), [xy(0, 1), xy(1 * MS, 2), z(2 * MS, 102)])
     assert block.readings.tolist() == [[2, 2, 102]]

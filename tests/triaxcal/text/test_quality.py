@@ -6,6 +6,7 @@ import pytest
 
 from triaxcal.poses.quality.finding import (
     AtRail,
+    Bursts,
     CoarseQuantization,
     Disturbance,
     DisturbedPoses,
@@ -44,6 +45,7 @@ LINES: list[tuple[QualityFinding, str]] = [
         StuckOutput((), None, (Freeze(None, 0.25, 3, 200, 21.0, Touched()),)),
         "stuck_output: all axes freeze 3 times, 200 samples at the longest, first at 21.0 s, in no pose",
     ),
+    (Bursts(25, 0.25), "bursts: 25 samples every 250 ms, taken for evenly spaced"),
     (MissingSamples(3, 6000, 1, 3, 10.0), "missing_samples: 3 of 6000 by the times, at 10.0 s"),
     (
         MissingSamples(4, 6000, 2, 3, 10.0),

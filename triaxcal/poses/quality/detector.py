@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.model.arrivals import RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import faults, mains
 from triaxcal.poses.quality.faults import CellKeeper, Gaps, RunLengths, StepEstimator
@@ -32,11 +33,7 @@ from triaxcal.poses.quality.finding import (
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import (
     OTHERWISE,
-    RATE_LEAST,
-    RATE_S,
-    RATE_SAMPLES,
     Windows,
-    first_period_ns,
     shown_step,
     window_size,
 )
@@ -120,24 +117,24 @@ class QualityDetector:
         if not self.samples or self._begin_ns is None:
             return []
         holds = StillIntervals.of(self._begin_ns, w, spans)
-        step, roughness = self._steps.step(), self._steps.roughness()
+        step, roughness = self._steps.step(), self._steps.roughness(self._runs.constant())
         if w is not None:
             # Printed decimals that are no multiples of the step hide it from
             # single differences.
             shown = shown_step(w)
             step = np.where(shown > OTHERWISE * step, shown, step)
-        noisy = self._steps.scatters(step)
+        noisy = self._steps.scatters(roughness, step)
         rate_hz = 1e9 / self._period_ns
         cells = self._cells.cells()
-        rails, affected = faults.saturation(cells, self._runs, holds, step, roughness, noisy)
-        # Rails, frozen runs, and the poses that they affect.
-        frozen = faults.frozen_runs(cells, self._runs, noisy)
+        # Frozen runs, rails, and the poses that they affect.
+        frozen = faults.frozen_runs(cells, self._runs, holds, noisy)
+        rails, affected = faults.saturation(cells, self._runs, frozen, holds, step, roughness, noisy)
         for poses, runs in zip(affected, frozen, strict=False):
             poses.update(i for r in (*runs, *frozen[-1]) for i in holds.touched(r.start_ns, r.end_ns))
         # Repeated samples, dead axes, mains lines.
         slow, twice = faults.repeated_samples(self._runs, noisy, rate_hz)
         flat = self._low == self._high
-        dead = [axis for i, axis in enumerate("xyz") if flat[i] and not flat.all()]
+        dead = [axis for axis, never_changes in zip(AXES, flat, strict=True) if never_changes]
         lines = self._spectra.lines(holds)
         found = [
             rails,

@@ -74,6 +74,23 @@ class Cells:
     def __len__(self) -> int:
         return len(self.start_ns)
 
+    def without(self, runs: Sequence[EqualRun]) -> Cells:
+        """The cells that overlap none of the ``runs``."""
+        kept = np.ones(len(self), dtype=bool)
+        for r in runs:
+            kept &= (self.end_ns < r.start_ns) | (self.start_ns > r.end_ns)
+        if kept.all():
+            return self
+        return Cells(
+            self.size,
+            self.start_ns[kept],
+            self.end_ns[kept],
+            self.high[kept],
+            self.low[kept],
+            self.at_high[kept],
+            self.at_low[kept],
+        )
+
 
 @dataclass
 class CellKeeper:
@@ -148,19 +165,21 @@ class StepEstimator:
         found = np.where(least > 0, least, np.inf).min(axis=0)
         return np.where(np.isfinite(found), found, 0.0)
 
-    def roughness(self) -> Floats:
+    def roughness(self, constant: Ints) -> Floats:
         """(3,) standard deviation of the noise from sample to sample; zero where most
-        of the stream has none."""
+        of the stream has none. ``constant`` (3,) are samples in which the axis repeats
+        one value for so long that they say nothing about its noise."""
         out = np.zeros(3)
-        for axis in np.flatnonzero(self._noisy > NOISY_SHARE * self._blocks).tolist():
+        blocks = self._blocks - constant // BLOCK
+        for axis in np.flatnonzero(self._noisy > NOISY_SHARE * blocks).tolist():
             out[axis] = np.sqrt(np.median(self._rough[axis])) if self._rough[axis] else 0.0
         return out
 
-    def scatters(self, step: Floats) -> Bools:
+    def scatters(self, roughness: Floats, step: Floats) -> Bools:
         """(3,) whether the noise exceeds half a ``step`` (3,), so that readings do
-        not stay on one value: in the median, and nearly so in every part of the
-        stream, such as after a vibrating machine is switched off."""
-        return np.asarray((self.roughness() > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
+        not stay on one value: in the median (``roughness``), and nearly so in every
+        part of the stream, such as after a vibrating machine is switched off."""
+        return np.asarray((roughness > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
 
 
 def _mean_square(differences: Floats, count: int) -> Floats:
@@ -193,6 +212,9 @@ shorter freeze of the output is not detected."""
 KEPT_MOST = 256
 """Largest number of runs that are kept of each row, which bounds the memory; all
 others are counted."""
+FROZEN_LEAST = 256
+"""Equal readings in a row that say nothing about chance: an output with as few changes
+has no noise to judge repeats by."""
 RUNS_LEAST = 200
 """Number of runs from which their length is estimated."""
 FALSE_ALARM = 1e-4
@@ -266,6 +288,10 @@ class RunLengths:
         open_run = [EqualRun(self._start_ns[row], self._last_ns, last, float(self._last[row % 3]))] if last else []
         return sorted(_longest(self._long[row], 0) + open_run, key=lambda r: r.start_ns)
 
+    def constant(self) -> Ints:
+        """(3,) samples in the longest run of each axis."""
+        return np.array([max((r.samples for r in self.runs(axis)), default=0) for axis in range(3)])
+
     def allowed(self, row: int) -> float:
         """Longest run that noise explains, from the decay of the run lengths;
         infinite where unknown.
@@ -301,9 +327,28 @@ class RunLengths:
 def _by_chance(changed: Bools) -> float:
     """Expected number of simultaneous repeats from ``changed`` (3,n), given the other
     combinations of repeating axes (log-linear model without the interaction of all
-    three; Bishop, Fienberg and Holland 1975)."""
-    n = np.bincount((~changed).astype(np.int8).T @ np.array([1, 2, 4], dtype=np.int8), minlength=8).astype(float)
-    return float(n[0] * n[3] * n[5] * n[6] / np.maximum(n[[1, 2, 4]], 1.0).prod())
+    three; Bishop, Fienberg and Holland 1975). Where one output is frozen, the repeats
+    of the two others are independent; where two are, those of the third count."""
+    frozen = np.array([_within_long_runs(row) for row in changed])
+    which = np.array([1, 2, 4], dtype=np.int8)
+    pattern = frozen.astype(np.int8).T @ which if frozen.any() else np.zeros(changed.shape[1], dtype=np.int8)
+    expected = 0.0
+    for frozen_axes in np.unique(pattern).tolist():
+        part = ~changed[:, pattern == frozen_axes]
+        live = part[(which & frozen_axes) == 0]
+        if len(live) == len(which):
+            n = np.bincount(part.astype(np.int8).T @ which, minlength=8).astype(float)
+            expected += float(n[0] * n[3] * n[5] * n[6] / np.maximum(n[[1, 2, 4]], 1.0).prod())
+        elif len(live):
+            expected += float(live.mean(axis=1).prod() * part.shape[1])
+    return expected
+
+
+def _within_long_runs(changed: Bools) -> Bools:
+    """(n,) samples inside runs of `FROZEN_LEAST` equal readings."""
+    edges = np.concatenate([[0], np.flatnonzero(changed), [len(changed)]])
+    length = np.diff(edges)
+    return np.repeat(length >= FROZEN_LEAST, length) if len(changed) else changed
 
 
 def _longest(found: list[EqualRun], unless: int) -> list[EqualRun]:
@@ -341,6 +386,9 @@ gives for 1 g."""
 SLOW_SHARE = 0.1
 """Share of repeated samples: below it some came twice, above it the sensor updates
 more slowly than it is read."""
+POSES_FROZEN = 3
+"""Poses through which an output is frozen at an extreme: a rail may be kept from one
+pose to the next where both are beyond it."""
 REPEATS_LEAST = 10
 """Least number of significant repeats."""
 REPEATED_SHARE = 0.002
@@ -349,15 +397,25 @@ harmless."""
 
 
 def saturation(
-    cells: Cells, runs: RunLengths, holds: StillIntervals, step: Floats, scatter: Floats, noisy: Bools
+    whole: Cells,
+    runs: RunLengths,
+    frozen: Sequence[Sequence[EqualRun]],
+    holds: StillIntervals,
+    step: Floats,
+    scatter: Floats,
+    noisy: Bools,
 ) -> tuple[QualityFinding | None, list[set[int]]]:
-    """A fault of saturation, and the poses at a rail, by axis."""
+    """A fault of saturation, and the poses at a rail, by axis. The ``frozen`` runs
+    (`frozen_runs`) reach no rail, whatever their value."""
     rails: list[AtRail] = []
     affected: list[set[int]] = [set(), set(), set()]
-    place = holds.within(cells.start_ns, cells.end_ns)
-    for axis in np.flatnonzero(noisy).tolist() if len(cells) else ():
+    for axis in np.flatnonzero(noisy).tolist():
+        cells = whole.without([*frozen[axis], *frozen[-1]])
+        if not len(cells):
+            continue
+        place = holds.within(cells.start_ns, cells.end_ns)
         # Test the extremes of every noisy axis, upper and lower.
-        long = [r for r in runs.runs(axis) if r.samples > runs.allowed(axis)]
+        long = [r for r in runs.runs(axis) if r.samples > runs.allowed(axis) and r not in frozen[axis]]
         for side, rail in zip((1, -1), _extremes(cells, axis), strict=True):
             value, count = _side(cells, axis, side)
             at_rail = value == side * rail
@@ -377,23 +435,32 @@ def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
     return float(cells.high[:, axis].max()), float(cells.low[:, axis].min())
 
 
-def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[EqualRun]]:
+def frozen_runs(whole: Cells, runs: RunLengths, holds: StillIntervals, noisy: Bools) -> list[list[EqualRun]]:
     """Runs longer than noise explains, by axis, and last those of all axes at once.
-    Runs of one axis at its extremes are rails."""
+    Runs of one axis at its extremes are rails, unless one of them goes on through
+    several poses to the end of the stream, or from its beginning."""
     found: list[list[EqualRun]] = [[], [], [], []]
-    if not (len(cells) and noisy.any()):
+    if not (len(whole) and noisy.any()):
         return found
     most = runs.allowed(ROWS - 1)
     found[-1] = [r for r in runs.runs(ROWS - 1) if r.samples > most]
     for axis in np.flatnonzero(noisy).tolist():
-        most, extremes = runs.allowed(axis), _extremes(cells, axis)
-        found[axis] = [
+        most, ends = runs.allowed(axis), (whole.start_ns[0], whole.end_ns[-1])
+        long = [
             r
             for r in runs.runs(axis)
-            if r.samples > most
-            and r.value not in extremes
-            and not any(r.start_ns <= a.end_ns and a.start_ns <= r.end_ns for a in found[-1])
+            if r.samples > most and not any(r.start_ns <= a.end_ns and a.start_ns <= r.end_ns for a in found[-1])
         ]
+        # A unit that moves leaves its rail between two poses.
+        dead = [
+            r
+            for r in long
+            if (r.start_ns <= ends[0] or r.end_ns >= ends[1])
+            and len(holds.touched(r.start_ns, r.end_ns)) >= POSES_FROZEN
+        ]
+        cells = whole.without([*dead, *found[-1]])
+        extremes = _extremes(cells, axis) if len(cells) else ()
+        found[axis] = [r for r in long if r in dead or r.value not in extremes]
     return found
 
 

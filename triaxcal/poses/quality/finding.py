@@ -109,6 +109,15 @@ class MissingSamples(QualityFinding):
 
 
 @dataclass(frozen=True)
+class Bursts(QualityFinding):
+    """The samples come together, ``samples`` every ``period_s`` (medians)."""
+
+    name: ClassVar[str] = "bursts"
+    samples: int
+    period_s: float
+
+
+@dataclass(frozen=True)
 class DuplicateSamples(QualityFinding):
     """``repeated`` samples equal the previous one on all axes."""
 

@@ -21,6 +21,7 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.errors import TooShort
+from triaxcal.model.arrivals import RATE_LEAST
 from triaxcal.poses.stillness.vibration import (
     ALONE_S,
     MOVE_SIGMA,
@@ -33,7 +34,6 @@ from triaxcal.poses.stillness.vibration import (
 )
 from triaxcal.poses.stillness.windows import (
     GUARD,
-    RATE_LEAST,
     SCALES,
     SPAN_LEAST_WINDOWS,
     NoiseScales,

@@ -18,34 +18,26 @@ from scipy.special import ndtr
 
 from triaxcal.arrays import READING_MOST, Bools, Floats, Ints, joined
 from triaxcal.errors import InvalidData
+from triaxcal.model.arrivals import GAP, RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 
 WINDOW_S = 0.1
 """Short beside a pose and a move, so that edges cost little; long beside a
 sample, so that summaries are few."""
 WINDOW_LEAST = 3
 """Samples in a window at low rates: fewer do not determine a scatter."""
-GAP = 4.0
-"""Sample periods of silence after which a window, and a span, ends."""
-RATE_SAMPLES = 64  # steps are taken over a quarter of them, so that bursts average out
-RATE_S = 1.0
-"""Samples, and duration, from which the sample period is estimated."""
-RATE_LEAST = 12
-"""Least samples of a shorter stream; with fewer the period is unknown and there is no
-window."""
-
-
-def first_period_ns(time_ns: Ints) -> float:
-    """Sample period at the beginning of a stream, from lags of a quarter of the
-    samples, robust against bursts and gaps."""
-    enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
-    time_ns = time_ns[:enough]
-    lag = len(time_ns) // 4
-    return float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag
 
 
 def window_size(period_ns: float) -> int:
     """Samples in a window."""
     return max(WINDOW_LEAST, round(WINDOW_S * 1e9 / period_ns))
+
+
+def require_finite(time_ns: Ints, readings: Floats) -> None:
+    """Raises InvalidData for a reading that is not a finite number."""
+    sound = np.abs(readings) < READING_MOST  # which no NaN is
+    if not sound.all():
+        at = int(np.flatnonzero(~sound.all(axis=1))[0])
+        raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
 
 
 @dataclass(frozen=True)
@@ -105,10 +97,7 @@ class WindowCutter:
         """
         if not len(time_ns):
             return
-        sound = np.abs(readings) < READING_MOST  # which no NaN is
-        if not sound.all():
-            at = int(np.flatnonzero(~sound.all(axis=1))[0])
-            raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
+        require_finite(time_ns, readings)
         if not self.samples:
             self._begin_ns = int(time_ns[0])
         self.samples += len(time_ns)

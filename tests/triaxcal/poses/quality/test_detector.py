@@ -385,3 +385,24 @@ def test_too_few_samples_are_judged_as_far_as_they_go(count: int) -> None:
     quality.feed(time_ns[:count], u[:count])
     quality.finish()
     assert quality.findings(None, []) == []
+
+
+ALL_AXES = [(axes, value) for axes in ([0], [1, 2], [0, 1, 2]) for value in (0.0, 0.25, -3.0, None)]
+
+
+@pytest.mark.parametrize(("axes", "value"), ALL_AXES)
+@pytest.mark.parametrize("since", [0.0, 0.05, 0.6])
+@pytest.mark.parametrize("step", [0.0, 1.0])
+def test_outputs_that_are_constant_from_some_time_on_are_stuck_and_nothing_else(
+    axes: list[int], value: float | None, since: float, step: float
+) -> None:
+    time_ns, u = stream(20, step=step * NOISE)
+    at = int(since * len(u))
+    u[at:, axes] = u[at, axes] if value is None else value
+    (found,) = judged(time_ns, u)
+    assert isinstance(found, StuckOutput)
+    if not since:
+        assert found.dead == tuple("xyz"[axis] for axis in axes)
+    else:
+        assert {f.axis for f in found.freezes} == ({"xyz"[axis] for axis in axes} if len(axes) < 3 else {None})
+        assert max(f.longest for f in found.freezes) == pytest.approx(len(u) - at, abs=20)
