@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from tests.devices.memory import Electronics, Refused
+from tests.devices.memory import Electronics, Refused, Silent
 from tests.devices.motion import Motion
 from tests.devices.place import Exchange, Place
 
@@ -44,6 +44,8 @@ class _Answer:
         function = pdu[0]
         if function not in (READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE):
             raise Refused("failed", ILLEGAL_FUNCTION)
+        if function == self.unit.habits.lacks_function:
+            raise Silent if self.unit.habits.when_lacking == "silent" else Refused("failed", ILLEGAL_FUNCTION)
         if len(pdu) < 5:
             raise Refused("length")
         address, number = struct.unpack(">HH", pdu[1:5])

@@ -51,6 +51,14 @@ def test_a_request_has_its_reply(request_pdu: str, reply: str) -> None:
     assert ask(modbus(), request_pdu) == bytes.fromhex(reply).hex()
 
 
+def test_a_function_that_it_lacks_is_refused_or_unanswered() -> None:
+    write = "10 0020 0001 02 C0DE"
+    assert ask(modbus(Habits(lacks_function=16)), write) == "9001"
+    assert ask(modbus(Habits(lacks_function=16)), UNLOCK) == bytes.fromhex(UNLOCK).hex()
+    silent = modbus(Habits(lacks_function=16, when_lacking="silent"))
+    assert not silent.exchange(bytes.fromhex(write), 0.0).replies
+
+
 def test_a_block_of_whole_registers_is_written_in_order() -> None:
     unit = modbus()
     ask(unit, UNLOCK)

@@ -25,8 +25,11 @@ from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, 
 from triaxcal_drivers.modbus.protocol import (
     GATEWAY_CODES,
     ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
     READ_HOLDING,
     READ_INPUT,
+    WRITE_MULTIPLE,
+    WRITE_SINGLE,
     DamagedReply,
     MalformedReply,
     Misanswered,
@@ -115,6 +118,9 @@ class ModbusDevice:
         self._client: ModbusClient | None = None
         self._owed_s = 0.0
         self._requested = ""
+        self._carried_out: set[int] = set()
+        """The functions for writing that the unit has answered with more than that it
+        lacks them."""
         self.discarded = 0
 
     async def open(self) -> None:
@@ -395,20 +401,45 @@ class ModbusDevice:
         if entry.table == "input":
             raise RegisterValueError(f"register {register}: an input register cannot be written")
         self._requested = register
-        single = self._profile.single_write and entry.words == 1
+        function = WRITE_SINGLE if self._profile.single_write and entry.words == 1 else WRITE_MULTIPLE
+        data, single = self._ordered(entry, raw), function == WRITE_SINGLE
         try:
-            await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
+            await self._connected().write(entry.address, data, single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
-            raise self._refused(register, "written", e) from e
+            lacks = f": {self._lacking(function, entry)}" if e.code == ILLEGAL_FUNCTION else ""
+            self._carried_out |= {function} if not lacks else set()
+            raise self._refused(register, "written", e, lacks) from e
         except MalformedReply as e:
             raise BusError(f"register {register}: {e}") from e
+        except DeviceSilent as e:
+            # A unit that has answered a function has it: its silence has another cause.
+            if function in self._carried_out or isinstance(e, Misanswered):
+                raise
+            where = self._place_of(register)
+            raise DeviceSilent(f"{where} cannot be written: {_cause(e)}: {self._lacking(function, entry)}") from e
+        self._carried_out.add(function)
 
-    def _refused(self, register: str, done: str, e: ModbusRefusal) -> RegisterRefused | DeviceSilent:
-        where = f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
+    def _lacking(self, function: int, register: ModbusRegister) -> str:
+        """What a missing function is, in the terms of the device and of the profile."""
+        silent = f"no answer to function {function}"
+        if function == WRITE_SINGLE:
+            return f"{silent}; does the device support only {WRITE_MULTIPLE}? (single_write = false)"
+        if self._profile.single_write:
+            return (
+                f"{silent}, which alone writes the {register.words} words of a {register.type}; "
+                f"single_write is for registers of one word"
+            )
+        return f"{silent}; does the device support only {WRITE_SINGLE}? (single_write)"
+
+    def _refused(self, register: str, done: str, e: ModbusRefusal, lacks: str = "") -> RegisterRefused | DeviceSilent:
+        where = self._place_of(register)
         if no_contact := self._no_contact(e):
             return DeviceSilent(f"{where} cannot be {done}: {no_contact}")
         kind = DeviceBusy if e.code in self._profile.busy_codes else RegisterRefused
-        return kind(f"{where} cannot be {done}: {e}", register=register, code=e.code)
+        return kind(f"{where} cannot be {done}: {e}{lacks}", register=register, code=e.code)
+
+    def _place_of(self, register: str) -> str:
+        return f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
 
     def _register(self, name: str) -> ModbusRegister:
         if name not in self._profile.registers:
