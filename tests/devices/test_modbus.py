@@ -99,6 +99,16 @@ def test_the_newest_sample_is_read_as_it_is_and_corrected() -> None:
     assert ask(unit, "04 0002 0002", 7.0) == "8402"
 
 
+def test_its_axes_may_lie_apart_and_other_registers_beside_them() -> None:
+    motion = Motion(lambda _: (1e-6, 2e-6, 3e-6), number="int32", apart=True, beside={0x80: lambda now: int(now)})
+    unit = modbus(motion=motion)
+    assert [ask(unit, f"04 000{2 * i} 0002") for i in range(3)] == [f"0404{i:08x}" for i in (1, 2, 3)]
+    assert ask(unit, "04 0000 0001") == "04020000"
+    assert ask(unit, "04 0080 0001", 7.0) == "04020007"
+    for refused in ("04 0000 0003", "04 0000 0006", "04 0001 0001", "04 0006 0002", "04 0080 0002"):
+        assert ask(unit, refused) == "8402"
+
+
 def test_a_device_may_correct_with_other_registers_than_its_own() -> None:
     unit = modbus(motion=Motion(lambda _: (0.0, 0.0, -2.5), follows_registers=False, number="int32"))
     assert ask(unit, "04 0040 0006") == "040c" + "00000000" * 2 + "000f4240"

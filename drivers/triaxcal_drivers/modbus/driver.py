@@ -227,12 +227,14 @@ class ModbusDecoder:
         held = replies if self._open is None else self._open.followed_by(replies)
         self._open = None
         good = ~held.failed
-        cycle = np.cumsum(self._begins(held)) - 1
+        begins, late = self._begins(held)
+        cycle = np.cumsum(begins) - 1
         # Those with a good reply to each request are whole, if they came in time.
         came = np.bincount(cycle[good], minlength=cycle.max(initial=-1) + 1)
         rows = np.flatnonzero(good & (came[cycle] == len(self._parts)))
         of = rows.reshape(-1, len(self._parts))
-        of = of[held.host_ns[of[:, -1]] - held.host_ns[of[:, 0]] <= self._spread_ns]
+        in_time = held.host_ns[of[:, -1]] - held.host_ns[of[:, 0]] <= self._spread_ns
+        of = of[in_time & ~np.isin(cycle[of[:, 0]], cycle[late])]
         # Count the others of which something came; the last one may go on.
         lost = came > 0
         lost[cycle[of[:, 0]]] = False
@@ -242,17 +244,19 @@ class ModbusDecoder:
         data = [held.data[of[:, i], : 2 * read.words] for i, read in enumerate(self._parts)]
         return (held[of[:, 0]], held[of[:, -1]]), np.concatenate(data, axis=1), int(lost.sum())
 
-    def _begins(self, held: _Replies) -> NDArray[np.bool_]:
-        """Which replies begin a cycle. The others go on with the one before: they are
-        to a later request of it, or to the same one, repeated after a failure at
-        once, and not after a time-out."""
-        begins = np.ones(len(held), dtype=bool)
+    def _begins(self, held: _Replies) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which replies begin a cycle, and which of the others come too late for it.
+
+        Those go on with the one before: they are to a later request of the cycle, or to
+        the same one, repeated after a failure. After a time-out that is too late.
+        """
+        begins, late = np.ones(len(held), dtype=bool), np.zeros(len(held), dtype=bool)
         step, failed = np.diff(held.part), held.failed
+        again = (step == 0) & failed[:-1] & ~failed[1:]
+        begins[1:] = ~(again | (step > 0)) | (held.part[1:] == 0) | (np.diff(held.gaps) > 0)
         waited_ns = np.diff(held.host_ns, prepend=held.host_ns[:1])
-        at_once = failed & (waited_ns <= self._at_once_ns)
-        goes_on = (step > 0) | ((step == 0) & at_once[:-1] & ~failed[1:])
-        begins[1:] = ~goes_on | (held.part[1:] == 0) | (np.diff(held.gaps) > 0)
-        return begins
+        late[1:] = again & ~begins[1:] & (waited_ns[:-1] > self._at_once_ns)
+        return begins, late
 
     def _fresh(self, first: _Replies, host_ns: Ints) -> NDArray[np.bool_]:
         """Whether the lasting values of each sample are new enough for it."""
