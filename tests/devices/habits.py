@@ -45,6 +45,11 @@ class Habits:
     word_order: Literal["big", "little"] = "big"
     """Modbus: the order of the words of a value on the wire."""
 
+    lacks_function: int | None = None
+    """Modbus: a function that it does not support."""
+    when_lacking: Literal["refuses", "silent"] = "refuses"
+    """refuses: by exception 1."""
+
     # How it stores.
     store_seconds: float = 0.0
     """So long a store takes, byte by byte evenly; without a store command, every write."""

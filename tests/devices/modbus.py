@@ -5,12 +5,12 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from tests.devices.memory import Electronics, Refused
+from tests.devices.memory import Electronics, Refused, Silent
 from tests.devices.motion import Motion
 from tests.devices.place import Exchange, Place
 
 READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE = 3, 4, 6, 16
-READINGS, CORRECTED, BLOCK_WORDS = 0x0000, 0x0040, 6
+READINGS, CORRECTED, BLOCK_WORDS, AXIS_WORDS = 0x0000, 0x0040, 6, 2
 """Input registers: x, y, z of two words each, read from their first word on."""
 EXCEPTIONS = {
     "unknown": 2, "read-only": 2, "write-only": 2, "length": 3, "value": 3, "locked": 4, "failed": 4, "busy": 6,
@@ -44,6 +44,8 @@ class _Answer:
         function = pdu[0]
         if function not in (READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE):
             raise Refused("failed", ILLEGAL_FUNCTION)
+        if function == self.unit.habits.lacks_function:
+            raise Silent if self.unit.habits.when_lacking == "silent" else Refused("failed", ILLEGAL_FUNCTION)
         if len(pdu) < 5:
             raise Refused("length")
         address, number = struct.unpack(">HH", pdu[1:5])
@@ -97,11 +99,19 @@ class _Answer:
         return names
 
     def _input(self, address: int, count: int) -> bytes:
-        if self.motion is None or address not in (READINGS, CORRECTED) or count > BLOCK_WORDS:
+        if self.motion is None:
             raise Refused("unknown")
-        triple = self.motion.shown if address == READINGS else self.motion.corrected
+        if address in self.motion.beside and count == 1:
+            return self._swapped(struct.pack(">H", self.motion.beside[address](self.now)))
+        start = next((at for at in (READINGS, CORRECTED) if at <= address < at + BLOCK_WORDS), address)
+        begins = range(0, BLOCK_WORDS, AXIS_WORDS) if self.motion.apart else (0,)
+        if start not in (READINGS, CORRECTED) or address - start not in begins:
+            raise Refused("unknown")
+        if count > (AXIS_WORDS if self.motion.apart else BLOCK_WORDS):
+            raise Refused("unknown")
+        triple = self.motion.shown if start == READINGS else self.motion.corrected
         shown = b"".join(map(self._ordered, self.motion.encode(triple(self.unit, self.now))))
-        return self._swapped(shown)[: 2 * count]
+        return self._swapped(shown)[2 * (address - start) :][: 2 * count]
 
     def _ordered(self, raw: bytes) -> bytes:
         if self.unit.habits.word_order == "big":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from tests.devices.memory import Electronics
 from tests.devices.table import AXES, FACTORY, QUANTITIES, Entry
@@ -34,12 +34,15 @@ def correct(readings: Triple, entries: Mapping[str, Entry], image: Mapping[str, 
 class Motion:
     """``readings`` [V] by the device's clock. With ``follows_registers`` False the device corrects with what lies in
     its ROM, whatever its registers hold. With ``corrects_all`` it has no output but the corrected one, and sends it as
-    its readings. ``number``: type of both blocks on Modbus; int32 in units of 1e-6."""
+    its readings. ``number``: type of both blocks on Modbus; int32 in units of 1e-6. ``apart``: on Modbus each axis is
+    a block of its own. ``beside``: further input registers there, by their addresses."""
 
     readings: Callable[[float], Triple] = at_rest
     follows_registers: bool = True
     number: str = "float32"
     corrects_all: bool = False
+    apart: bool = False
+    beside: Mapping[int, Callable[[float], int]] = field(default_factory=dict)
 
     def shown(self, unit: Electronics, now: float) -> Triple:
         """What the device sends as its readings."""

@@ -57,6 +57,7 @@ def row(
 
 RESTARTED = "read back after a restart"
 UNPROVEN = "no restart has proven it"
+ONLY_6 = "no answer to function 16; does the device support only 6? (single_write)"
 OLD_BACK = "the device holds the old calibration"
 
 # fmt: off
@@ -133,6 +134,9 @@ ROWS = (
         habits=Habits(alternates=frozenset({"misalignment_x"}), checksum=False)),
     row("ignores writes, as it is locked with another key", "old", "old", 4, "expected",
         habits=Habits(when_locked="ignores"), wording=Wording(key=1)),
+    row("supports only function 6 to write", "old", "untouched", 4, ONLY_6, habits=Habits(lacks_function=16)),
+    row("supports only function 6 to write, and leaves others unanswered", "old", "untouched", 4, ONLY_6,
+        habits=Habits(lacks_function=16, when_lacking="silent"), timing=QUICK),
     # What it holds at first.
     row("holds a checksum that does not fit", "old", "untouched", 3, "checksum",
         habits=Habits(stored_checksum_wrong=True)),

@@ -51,6 +51,14 @@ def test_a_request_has_its_reply(request_pdu: str, reply: str) -> None:
     assert ask(modbus(), request_pdu) == bytes.fromhex(reply).hex()
 
 
+def test_a_function_that_it_lacks_is_refused_or_unanswered() -> None:
+    write = "10 0020 0001 02 C0DE"
+    assert ask(modbus(Habits(lacks_function=16)), write) == "9001"
+    assert ask(modbus(Habits(lacks_function=16)), UNLOCK) == bytes.fromhex(UNLOCK).hex()
+    silent = modbus(Habits(lacks_function=16, when_lacking="silent"))
+    assert not silent.exchange(bytes.fromhex(write), 0.0).replies
+
+
 def test_a_block_of_whole_registers_is_written_in_order() -> None:
     unit = modbus()
     ask(unit, UNLOCK)
@@ -89,6 +97,16 @@ def test_the_newest_sample_is_read_as_it_is_and_corrected() -> None:
     assert ask(unit, "04 0040 0006", 7.0) == "040c" + "00000000" * 2 + "000f4240"
     assert ask(unit, "04 0000 0002", 7.0) == "0404" + "ffffb500"
     assert ask(unit, "04 0002 0002", 7.0) == "8402"
+
+
+def test_its_axes_may_lie_apart_and_other_registers_beside_them() -> None:
+    motion = Motion(lambda _: (1e-6, 2e-6, 3e-6), number="int32", apart=True, beside={0x80: lambda now: int(now)})
+    unit = modbus(motion=motion)
+    assert [ask(unit, f"04 000{2 * i} 0002") for i in range(3)] == [f"0404{i:08x}" for i in (1, 2, 3)]
+    assert ask(unit, "04 0000 0001") == "04020000"
+    assert ask(unit, "04 0080 0001", 7.0) == "04020007"
+    for refused in ("04 0000 0003", "04 0000 0006", "04 0001 0001", "04 0006 0002", "04 0080 0002"):
+        assert ask(unit, refused) == "8402"
 
 
 def test_a_device_may_correct_with_other_registers_than_its_own() -> None:

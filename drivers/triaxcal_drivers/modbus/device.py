@@ -21,11 +21,15 @@ from triaxcal_drivers.errors import (
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.line import ModbusClient
-from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream
+from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, Read
 from triaxcal_drivers.modbus.protocol import (
     GATEWAY_CODES,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
     READ_HOLDING,
     READ_INPUT,
+    WRITE_MULTIPLE,
+    WRITE_SINGLE,
     DamagedReply,
     MalformedReply,
     Misanswered,
@@ -50,19 +54,34 @@ without a request and with other bytes than the previous reply. A single one may
 a very late reply, or one to a request that a gateway repeated."""
 
 _EMPTY = "it answers, but its FIFO stays empty"
+_RETRY = 0.1
+"""Share of ``latest_s`` after which a failed request for a lasting value is repeated:
+five times before the value is too old, and not before each sample."""
 
 Record = tuple[int, int, int, bytes]
 
 
 @dataclass
+class _Lasting:
+    """State of a request for lasting values; ``due_s`` by the loop's clock."""
+
+    read: Read
+    due_s: float
+
+
+@dataclass
 class _PolledStream:
     """State of a polled stream. ``due_s`` is the time of the next request by the loop's
-    clock, ``last_sample_s`` that of the last sample by the unit's own time."""
+    clock, ``last_sample_s`` that of the last sample by the unit's own time; ``next``
+    numbers the next request for a sample."""
 
     name: str
     stream: PollStream | FifoStream
+    reads: Sequence[Read]
+    lasting: Sequence[_Lasting]
     due_s: float
     last_sample_s: float
+    next: int = 0
     cause: str = "no reply"
     unanswered: int = 0
     """Consecutive requests without a reply."""
@@ -72,7 +91,15 @@ class _PolledStream:
 
     @property
     def source(self) -> int:
-        return self.stream.function << 16 | self.stream.address
+        return self.reads[0].source
+
+    def refusal(self, e: ModbusRefusal, read: Read) -> str:
+        """An exception, with its place if there are several, and what it may mean."""
+        several = len(self.reads) + len(self.lasting) > 1
+        where = f" to function {read.function} at 0x{read.address:04X}" if several else ""
+        if e.code == ILLEGAL_ADDRESS and read.unrequested:
+            return f"{e}{where}; it may lack the registers between the channels, which max_gap = 0 leaves out"
+        return f"{e}{where}"
 
 
 class ModbusDevice:
@@ -91,6 +118,9 @@ class ModbusDevice:
         self._client: ModbusClient | None = None
         self._owed_s = 0.0
         self._requested = ""
+        self._carried_out: set[int] = set()
+        """The functions for writing that the unit has answered with more than that it
+        lacks them."""
         self.discarded = 0
 
     async def open(self) -> None:
@@ -166,12 +196,13 @@ class ModbusDevice:
             await self._discard(self._polling(name))
         # Poll each stream when it is due.
         polled = [self._polling(name) for name in names]
+        self._share_lasting(polled)
         contradictions = deque[bool](maxlen=_POLLS)
         while polled:
             await asyncio.sleep(min(p.due_s for p in polled) - loop.time())
             for p in [p for p in polled if p.due_s <= loop.time()]:
                 p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
-                records = await self._drain(p)
+                records = await (self._drain(p, p.stream) if isinstance(p.stream, FifoStream) else self._cycle(p))
                 yield RawBatch.of(records)
                 # Replies without a request come from a second unit with this address.
                 contradictions.append(any(not e.same for e in await self.listen(0.0)))
@@ -208,7 +239,17 @@ class ModbusDevice:
 
     def _polling(self, name: str) -> _PolledStream:
         now_s = asyncio.get_running_loop().time()
-        return _PolledStream(name, self._profile.streams[name], now_s, self._connected().own_s)
+        reads = self._profile.reads(name)
+        lasting = [_Lasting(read, now_s) for read in reads.lasting]
+        own_s = self._connected().own_s
+        return _PolledStream(name, self._profile.streams[name], reads.of_sample, lasting, now_s, own_s)
+
+    @staticmethod
+    def _share_lasting(polled: Sequence[_PolledStream]) -> None:
+        """Equal requests of several streams become one."""
+        shared: dict[Read, _Lasting] = {}
+        for p in polled:
+            p.lasting = [shared.setdefault(lasting.read, lasting) for lasting in p.lasting]
 
     async def _discard(self, p: _PolledStream) -> None:
         """Removes from a stream's FIFO the records that it had at the first reply, in
@@ -220,7 +261,7 @@ class ModbusDevice:
         deadline_s = math.inf if counted else loop.time() + _DISCARD_S
         left: float = math.inf
         while left > 0 and loop.time() < deadline_s:
-            flags, data = await self._request(p)
+            flags, data = await self._request(p, p.reads[0])
             taken, remaining = self._record_counts(p.stream, data) if not flags else (0, math.inf)
             if taken > p.stream.record_capacity:  # not a count of this device
                 taken, remaining = 0, math.inf
@@ -233,16 +274,46 @@ class ModbusDevice:
                 self._check_silence(p)
                 await asyncio.sleep(p.stream.poll_period_s)
 
-    async def _drain(self, p: _PolledStream) -> list[Record]:
-        """Reads a stream once, or until its FIFO is empty, at most `_BATCH_REPLIES`
-        times."""
+    async def _cycle(self, p: _PolledStream) -> list[Record]:
+        """Reads the lasting values that are due, then what makes a sample, and ends at
+        the first request of these that fails: the sample is lost. It goes on there at
+        the next call if that request is to be repeated at once."""
+        loop = asyncio.get_running_loop()
+        records: list[Record] = []
+        for lasting in p.lasting if p.next == 0 else ():
+            if lasting.due_s > loop.time():
+                continue
+            record = await self._record(p, lasting.read)
+            failed = bool(record[2])
+            pause_s = _RETRY * (lasting.read.latest_s or 0.0) if failed else lasting.read.renewed_s
+            lasting.due_s = loop.time() + pause_s
+            records.append(record)
+        while p.next < len(p.reads):
+            record = await self._record(p, p.reads[p.next])
+            records.append(record)
+            if record[2]:
+                p.next = p.next if p.again else 0
+                return records
+            p.next += 1
+        p.next = 0
+        p.last_sample_s = self._connected().own_s
+        return records
+
+    async def _record(self, p: _PolledStream, read: Read) -> Record:
+        """One request, as its record."""
+        requested_ns, requested_s = self._now_ns(), self._connected().clock_s
+        flags, data = await self._request(p, read)
+        return self._arrival_ns(requested_ns, requested_s), read.source, flags, data
+
+    async def _drain(self, p: _PolledStream, stream: FifoStream) -> list[Record]:
+        """Reads a FIFO until it is empty, at most `_BATCH_REPLIES` times."""
         records: list[Record] = []
         for _ in range(_BATCH_REPLIES):
-            requested_ns, requested_s = self._now_ns(), self._connected().clock_s
-            flags, data = await self._request(p)
-            taken, remaining = self._record_counts(p.stream, data) if not flags else (0, 0)
+            record = await self._record(p, p.reads[0])
+            _, _, flags, data = record
+            taken, remaining = self._record_counts(stream, data) if not flags else (0, 0)
             if flags or taken:
-                records.append((self._arrival_ns(requested_ns, requested_s), p.source, flags, data))
+                records.append(record)
             if taken:
                 p.last_sample_s = self._connected().own_s
             elif not flags:
@@ -259,14 +330,14 @@ class ModbusDevice:
         now_ns = self._now_ns()
         return min(now_ns, requested_ns + round(waited_s * 1e9)) if math.isfinite(waited_s) else now_ns
 
-    async def _request(self, p: _PolledStream) -> tuple[RawFlag, bytes]:
+    async def _request(self, p: _PolledStream, read: Read) -> tuple[RawFlag, bytes]:
         """Flags and bytes of one reply. Records the cause of a failure in ``p``."""
         unanswered, p.unanswered, p.again = p.unanswered, 0, False
         try:
-            data = await self._connected().read(p.stream.function, p.stream.address, p.stream.words)
+            data = await self._connected().read(read.function, read.address, read.words)
         except ModbusRefusal as e:
             no_contact = self._no_contact(e)
-            p.cause = no_contact or str(e)
+            p.cause = no_contact or p.refusal(e, read)
             p.unanswered = unanswered + 1 if no_contact else 0
             return RawFlag.ERROR, bytes([e.code])
         except MalformedReply as e:
@@ -279,10 +350,8 @@ class ModbusDevice:
             return RawFlag.ERROR, b""
         return RawFlag(0), data
 
-    def _record_counts(self, stream: PollStream | FifoStream, data: bytes) -> tuple[int, int]:
+    def _record_counts(self, stream: FifoStream, data: bytes) -> tuple[int, int]:
         """Number of records in a reply, and of records left in the device."""
-        if not isinstance(stream, FifoStream):
-            return 1, 0
 
         def number(word: int) -> int:
             return int.from_bytes(data[2 * word : 2 * word + 2], self._profile.byte_order)
@@ -332,20 +401,45 @@ class ModbusDevice:
         if entry.table == "input":
             raise RegisterValueError(f"register {register}: an input register cannot be written")
         self._requested = register
-        single = self._profile.single_write and entry.words == 1
+        function = WRITE_SINGLE if self._profile.single_write and entry.words == 1 else WRITE_MULTIPLE
+        data, single = self._ordered(entry, raw), function == WRITE_SINGLE
         try:
-            await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
+            await self._connected().write(entry.address, data, single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
-            raise self._refused(register, "written", e) from e
+            lacks = f": {self._lacking(function, entry)}" if e.code == ILLEGAL_FUNCTION else ""
+            self._carried_out |= {function} if not lacks else set()
+            raise self._refused(register, "written", e, lacks) from e
         except MalformedReply as e:
             raise BusError(f"register {register}: {e}") from e
+        except DeviceSilent as e:
+            # A unit that has answered a function has it: its silence has another cause.
+            if function in self._carried_out or isinstance(e, Misanswered):
+                raise
+            where = self._place_of(register)
+            raise DeviceSilent(f"{where} cannot be written: {_cause(e)}: {self._lacking(function, entry)}") from e
+        self._carried_out.add(function)
 
-    def _refused(self, register: str, done: str, e: ModbusRefusal) -> RegisterRefused | DeviceSilent:
-        where = f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
+    def _lacking(self, function: int, register: ModbusRegister) -> str:
+        """What a missing function is, in the terms of the device and of the profile."""
+        silent = f"no answer to function {function}"
+        if function == WRITE_SINGLE:
+            return f"{silent}; does the device support only {WRITE_MULTIPLE}? (single_write = false)"
+        if self._profile.single_write:
+            return (
+                f"{silent}, which alone writes the {register.words} words of a {register.type}; "
+                f"single_write is for registers of one word"
+            )
+        return f"{silent}; does the device support only {WRITE_SINGLE}? (single_write)"
+
+    def _refused(self, register: str, done: str, e: ModbusRefusal, lacks: str = "") -> RegisterRefused | DeviceSilent:
+        where = self._place_of(register)
         if no_contact := self._no_contact(e):
             return DeviceSilent(f"{where} cannot be {done}: {no_contact}")
         kind = DeviceBusy if e.code in self._profile.busy_codes else RegisterRefused
-        return kind(f"{where} cannot be {done}: {e}", register=register, code=e.code)
+        return kind(f"{where} cannot be {done}: {e}{lacks}", register=register, code=e.code)
+
+    def _place_of(self, register: str) -> str:
+        return f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
 
     def _register(self, name: str) -> ModbusRegister:
         if name not in self._profile.registers:

@@ -86,6 +86,53 @@ async def test_registers_are_read_and_written_over_a_serial_line(bundle, serial_
     assert len(heard) == 3
 
 
+SINGLE = ('name = "by-hand"', 'name = "by-hand"\nsingle_write = true')
+ONLY_6 = "no answer to function 16; does the device support only 6? (single_write)"
+ONLY_16 = "no answer to function 6; does the device support only 16? (single_write = false)"
+
+
+@pytest.mark.parametrize(
+    ("replaced", "register", "request_pdu", "exception", "words"),
+    [
+        ([], "setting", "10 0001 0001 02 0003", "90 01", ONLY_6),
+        ([], "pair", "10 0001 0002 04 000A 0102", "90 01", ONLY_6),
+        ([], "setting", "10 0001 0001 02 0003", None, ONLY_6),
+        ([SINGLE], "setting", "06 0001 0003", "86 01", ONLY_16),
+        ([SINGLE], "setting", "06 0001 0003", None, ONLY_16),
+        ([SINGLE], "pair", "10 0001 0002 04 000A 0102", "90 01", "alone writes the 2 words of a uint32"),
+        ([], "setting", "10 0001 0001 02 0003", "90 02", None),  # it has the function
+        ([SINGLE], "setting", "06 0001 0003", "86 04", None),
+    ],
+)
+async def test_a_function_that_the_unit_lacks_is_named_with_the_key(
+    bundle, tcp_device, replaced, register, request_pdu, exception, words
+):
+    def framed(pdu, transaction=2):
+        data = bytes.fromhex(f"11 {pdu}")
+        return (bytes([0, transaction, 0, 0, 0, len(data)]) + data).hex()
+
+    async with tcp_device(PROBE, (framed(request_pdu), framed(exception) if exception else None)) as heard:
+        device = await opened(bundle(*replaced, hasty=True), heard)
+        raw = {"setting": b"\x00\x03", "pair": bytes.fromhex("000A 0102")}[register]
+        with pytest.raises(RegisterRefused if exception else DeviceSilent) as caught:
+            await device.write(register, raw)
+        await device.close()
+    assert f"register {register} (0x0001) cannot be written" in str(caught.value)
+    assert words in str(caught.value) if words else "single_write" not in str(caught.value)
+    assert len(heard) == 2
+
+
+async def test_silence_after_a_write_that_was_answered_says_nothing_of_functions(bundle, tcp_device):
+    write = "0000 0009 11 10 0001 0001 02 0003"
+    exchanges = [PROBE, (f"0002 {write}", "0002 0000 0006 11 10 0001 0001"), (f"0003 {write}", None)]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(hasty=True), heard)
+        await device.write("setting", b"\x00\x03")
+        with pytest.raises(DeviceSilent, match=r"no reply in 0\.2 s$"):
+            await device.write("setting", b"\x00\x03")
+        await device.close()
+
+
 async def test_a_stream_is_polled_over_a_serial_line(bundle, serial_device):
     exchanges = [RTU_PROBE, ("11 03 00 6B 00 03 76 87", "11 03 06 AE 41 56 52 43 40 49 AD")]
     async with serial_device(*exchanges) as heard:
