@@ -116,8 +116,9 @@ def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> tc.Floats:
     """(n,3): the directions of up of the poses that a calibration is made of,
     to a degree or so. ``signs`` of the outputs, where the profile has no
     nominal scale factors."""
-    nominal = readings.bundle.profile.output.nominal_scale_factor
-    up = ups(readings.poses(), nominal)
+    output = readings.bundle.profile.output
+    nominal = output.nominal_scale_factor
+    up = ups(readings.poses(), nominal, output.offsets)
     return up if nominal is not None else up * np.asarray(signs)
 
 

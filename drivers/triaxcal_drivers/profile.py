@@ -74,6 +74,10 @@ class Output(Strict):
         tuple[float, float, float] | None,
         Field(description="output per g, with its sign; guides the operator and gives the signs"),
     ] = None
+    nominal_offset: Annotated[
+        float | tuple[float, float, float],
+        Field(description="output at 0 g, of each axis or of all: 2.5 where an analog output of 5 V is in the middle"),
+    ] = 0.0
     thermal_sensitivity_per_k: Annotated[
         float | None,
         Field(ge=0, le=0.1, description="by how much 1 K changes bias [g] and scale factor [relative], for the budget"),
@@ -84,6 +88,12 @@ class Output(Strict):
         if self.nominal_scale_factor and 0.0 in self.nominal_scale_factor:
             raise ValueError("nominal_scale_factor must not be zero")
         return self
+
+    @property
+    def offsets(self) -> tuple[float, float, float]:
+        """Of the three axes, at 0 g."""
+        given = self.nominal_offset
+        return given if isinstance(given, tuple) else (given, given, given)
 
     @property
     def signs(self) -> tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None:
@@ -439,6 +449,10 @@ class Profile(Strict):
         if stream != self.own_output or (self.reads_corrected and nominal is not None):
             return nominal
         return (self.output_per_g,) * 3
+
+    def offset_of(self, stream: str) -> tuple[float, float, float]:
+        """Nominal output of a stream at 0 g."""
+        return self.output.offsets if stream == READINGS else (0.0, 0.0, 0.0)
 
     @property
     def reads_corrected(self) -> bool:

@@ -18,7 +18,7 @@ SYNC = 0x080
 
 
 class MappedNode:
-    """A unit with one TPDO on a python-can bus of this process. ``value_of(index, subindex, s)`` is what an object
+    """A unit with one ``tpdo`` on a python-can bus of this process. ``value_of(index, subindex, s)`` is what an object
     holds, ``delivered`` what those of the mapping hold at first. What is written lasts until `restart`."""
 
     def __init__(
@@ -28,6 +28,7 @@ class MappedNode:
         eds: Path,
         value_of: Callable[[int, int, float], int],
         delivered: Mapping[tuple[int, int], int],
+        tpdo: int = 1,
     ) -> None:
         self._network = canopen.Network()
         self._network.connect(interface="virtual", channel=channel)
@@ -35,7 +36,7 @@ class MappedNode:
         self.node.object_dictionary.add_object(_identity())
         self._network.add_node(self.node)
         self._network.subscribe(SYNC, self._on_sync)
-        self._value_of, self._delivered = value_of, delivered
+        self._value_of, self._delivered, self._tpdo = value_of, delivered, tpdo
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self.sent = 0
@@ -65,26 +66,26 @@ class MappedNode:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            period_s = self._held(0x1800, 5) / 1000
-            if self._held(0x1800, 2) == BY_TIMER and period_s:
+            period_s = self._held(0x17FF + self._tpdo, 5) / 1000
+            if self._held(0x17FF + self._tpdo, 2) == BY_TIMER and period_s:
                 self._send()
             self._stop.wait(period_s or 0.01)
 
     def _on_sync(self, *_: object) -> None:
-        if self._held(0x1800, 2) == BY_SYNC:
+        if self._held(0x17FF + self._tpdo, 2) == BY_SYNC:
             self._send()
 
     def _send(self) -> None:
         if self.node.nmt.state not in ("OPERATIONAL", "INITIALISING"):  # it starts by itself
             return
         data, now_s = b"", time.monotonic() - self._begun_s
-        for entry in range(1, self._held(0x1A00, 0) + 1):
-            word = self._held(0x1A00, entry)
+        for entry in range(1, self._held(0x19FF + self._tpdo, 0) + 1):
+            word = self._held(0x19FF + self._tpdo, entry)
             octets = (word & 0xFF) // 8
             value = self._value_of(word >> 16, word >> 8 & 0xFF, now_s)
             data += value.to_bytes(octets, "little", signed=True)
         self.sent += 1
-        self._network.send_message(0x180 + self.node.id, data)
+        self._network.send_message(0x80 + 0x100 * self._tpdo + self.node.id, data)
 
 
 def _identity() -> od.ODRecord:

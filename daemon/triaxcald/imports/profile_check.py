@@ -383,8 +383,8 @@ class _Stream:
         means = np.array([span.mean for span in self._still()])
         if not len(means):
             return None, None
-        nominal = self._profile.nominal_of(self._name)
-        in_g = None if nominal is None else float(np.median(np.linalg.norm(means / nominal, axis=1)))
+        nominal, offset = self._profile.nominal_of(self._name), self._profile.offset_of(self._name)
+        in_g = None if nominal is None else float(np.median(np.linalg.norm((means - offset) / nominal, axis=1)))
         return float(np.median(np.linalg.norm(means, axis=1))), in_g
 
     def judge(self, found: _Found) -> None:

@@ -626,6 +626,7 @@ class UnitRun(UnitSession):
             wanted=wanted,
             targets=targets,
             nominal_scale_factor=self.profile.nominal_of(stream),
+            nominal_offset=self.profile.offset_of(stream),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
             apart_from=apart_from,
             on_demand=on_demand,

@@ -96,6 +96,7 @@ def guide(
     apart_deg: float,
     now_s: float,
     nominal_scale_factor: Sequence[float] | None,
+    nominal_offset: Sequence[float] = (0.0, 0.0, 0.0),
     plan: bool = True,
     repeat: bool = False,
     counted_s: Collection[float] = (),
@@ -121,7 +122,7 @@ def guide(
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.
     still_s = last.end_s - last.start_s if last is not None and now_s - last.end_s < 0.5 else 0.0
-    up = ups(poses, nominal_scale_factor)
+    up = ups(poses, nominal_scale_factor, nominal_offset)
     enough = [p.end_s - p.start_s >= hold_s or any(p.start_s <= t <= p.end_s for t in counted_s) for p in poses]
     held = [v for v, is_enough in zip(up, enough, strict=True) if is_enough]
     taken = [] if apart_from is None else list(apart_from)
@@ -215,14 +216,16 @@ def _again(targets: Sequence[tc.planning.Direction], v: tc.Floats) -> NextPose:
     return _pose_of(label, direction, once_more=True)
 
 
-def ups(poses: Sequence[tc.StillSpan], nominal: Sequence[float] | None) -> tc.Floats:
-    """Up in the unit's frame, roughly: by the nominal scale factor, else by the
-    range of the outputs so far."""
+def ups(
+    poses: Sequence[tc.StillSpan], nominal: Sequence[float] | None, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> tc.Floats:
+    """Up in the unit's frame, roughly: by the nominal scale factor and the nominal
+    ``offset``, else by the range of the outputs so far."""
     if not poses:
         return np.zeros((0, 3))
     u = np.array([p.mean for p in poses])
     if nominal is not None:
-        a = u / np.asarray(nominal)
+        a = (u - np.asarray(offset)) / np.asarray(nominal)
     else:
         middle = (u.max(axis=0) + u.min(axis=0)) / 2
         a = (u - middle) / max(float(np.max(np.ptp(u, axis=0))) / 2, 1e-300)

@@ -69,30 +69,26 @@ class TogetherInTime:
 
 class TogetherFromBegin:
     """A sample begins with message ``begins`` and takes each other one once before
-    the next begin, within one period. ``messages`` is how many a whole sample
-    has. Messages whose begin was lost are a sample of their own, which is never
-    whole; those before the first begin belong to none."""
+    the next begin. ``messages`` is how many a whole sample has. Messages whose begin
+    was lost are a sample of their own, which is never whole; those before the first
+    begin belong to none."""
 
-    def __init__(self, messages: int, begins: int, period_ns: float) -> None:
-        self._messages, self._begins, self._period_ns = messages, begins, period_ns
+    def __init__(self, messages: int, begins: int) -> None:
+        self._messages, self._begins = messages, begins
         self._had: set[int] = set()
-        self._start_ns = 0
-        self._headless = False
         self._begun = False
 
     def samples_of(self, time_ns: Ints, message: Ints) -> Ints:
         """The sample of each record, as of `TogetherInTime`; -1 for none."""
         sample = np.full(len(time_ns), -1, dtype=np.int64)
         number = 0 if self._had else -1
-        for i, (at_ns, which) in enumerate(zip(time_ns.tolist(), message.tolist(), strict=True)):
+        for i, which in enumerate(message.tolist()):
             if which == self._begins:
-                number, self._begun = number + 1, True
-                self._had, self._start_ns, self._headless = {which}, at_ns, False
+                number, self._begun, self._had = number + 1, True, {which}
             elif not self._begun:
                 continue
-            elif not self._had or which in self._had or abs(at_ns - self._start_ns) > self._period_ns:
-                number += 1
-                self._had, self._start_ns, self._headless = {which}, at_ns, True
+            elif not self._had or which in self._had:
+                number, self._had = number + 1, {which}
             else:
                 self._had.add(which)
             sample[i] = number
@@ -104,6 +100,38 @@ class TogetherFromBegin:
     def open(self) -> bool:
         """Whether the last sample still lacks messages."""
         return bool(self._had)
+
+
+BEGINS = 4
+"""Begins that are waited for where a message came later than a period after its
+begin: either the next begin was lost, and the message is of the next sample, or the
+host was late. With more of them a device that is a tenth too fast looks as if none
+were lost."""
+
+
+def _mixed(time_ns: Ints, is_begin: NDArray[np.bool_], sample: Ints, period_ns: float) -> tuple[NDArray[np.bool_], int]:
+    """Which samples (of parts in the order of ``sample``) may have messages of another
+    one, and the first of which nobody knows yet; the number of samples without one.
+
+    A message within a period of its begin is of that sample. A later one is so too
+    where the begins that follow come so early that none of them can be missing.
+    """
+    samples = int(sample[-1]) + 1 if len(sample) else 0
+    mixed, unknown = np.zeros(samples, dtype=bool), samples
+    begin_ns = np.full(samples, np.iinfo(np.int64).max)
+    begin_ns[sample[is_begin]] = time_ns[is_begin]
+    begun = np.flatnonzero(begin_ns < np.iinfo(np.int64).max)
+    late = np.unique(sample[time_ns - period_ns > begin_ns[sample]])
+    for number in late.tolist():
+        after = begun[np.searchsorted(begun, number, side="right") :][:BEGINS]
+        periods = (begin_ns[after] - begin_ns[number]) / period_ns
+        if (periods < np.arange(1, len(after) + 1) + 0.5).any():
+            continue
+        if len(after) < BEGINS:
+            unknown = min(unknown, number)
+        else:
+            mixed[number] = True
+    return mixed, unknown
 
 
 _EXACT = (1 << 52) - 1
@@ -305,13 +333,15 @@ class CanDecoder:
         empty = np.zeros(0, dtype=np.int64)
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
         self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool), empty)
+        self._held_sample = empty  # of each part that is held, where no counter says so
         self._together: TogetherInTime | TogetherFromBegin = (
             TogetherInTime(layout.sample, self._period_ns)
             if layout.begins is None
-            else TogetherFromBegin(layout.sample, layout.begins, self._period_ns)
+            else TogetherFromBegin(layout.sample, layout.begins)
         )
         self._beside = _Beside(layout) if layout.latest_s else None
         self._timeline = _timeline(layout, self._period_ns)
+        self._given_up = 0  # samples that no counter has missed so far
         self._placed_ns = 0  # host time of the last sample that it placed
         self._order = 0  # records of the stream so far
         self._arrived = Arrived(len(self._columns))
@@ -441,13 +471,19 @@ class CanDecoder:
     def _joined(self, parts: _Parts) -> SampleBlock:
         """Join parts to samples; parts of an incomplete sample are kept for the next
         batch."""
+        # Those held back are whole, but for the last where it was open.
+        before = int(self._held_sample[-1]) + 1 - self._together.open if len(self._held_sample) else 0
         joined = self._together.samples_of(parts.time_ns, parts.message)
-        sample = np.concatenate([np.zeros(len(self._held), dtype=np.int64), joined[joined >= 0]])
+        sample = np.concatenate([self._held_sample, before + joined[joined >= 0]])
         parts = self._held.followed_by(parts[joined >= 0])
         last = int(sample[-1]) if len(sample) else -1
         settled = last if self._together.open else last + 1
-        self._held = parts[sample >= settled]
         complete = np.bincount(sample, minlength=settled)[:settled] == self._layout.sample
+        if self._layout.begins is not None:
+            mixed, unknown = _mixed(parts.time_ns, parts.message == self._layout.begins, sample, self._period_ns)
+            settled = min(settled, unknown)
+            complete = complete[:settled] & ~mixed[:settled]
+        self._held, self._held_sample = parts[sample >= settled], sample[sample >= settled] - settled
         values = self._rows(parts, sample, last + 1)[:, :settled]
         time_ns = self._arrived.in_order(parts.time_ns[np.searchsorted(sample, np.arange(settled))], values)
         counter = self._settled + np.arange(settled)
@@ -455,7 +491,12 @@ class CanDecoder:
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
         firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)[complete]
         block = self._block(time_ns[complete], counter[complete], values[:, complete], firsts)
-        return replace(block, incomplete=block.incomplete + settled - int(complete.sum()))
+        given_up = settled - int(complete.sum())
+        # A counter misses those too that are given up.
+        self._given_up += given_up
+        known = min(self._given_up, block.missing)
+        self._given_up -= known
+        return replace(block, incomplete=block.incomplete + given_up, missing=block.missing - known)
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
         """The values (columns, rows) of parts that belong to samples ``row``."""

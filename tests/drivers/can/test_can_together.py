@@ -130,6 +130,38 @@ def test_no_jitter_below_a_period_costs_a_sample(rate_hz: int, seed: int) -> Non
     assert (len(block), block.incomplete, block.missing) == (300, 0, 0)
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("cuts", [(), tuple(range(1, 800))])
+def test_no_pause_of_the_host_costs_a_sample(seed: int, cuts: Sequence[int]) -> None:
+    """Frames that wait are stamped together, in mid cycle too."""
+    rng = np.random.default_rng(seed)
+    frames = [record for k in range(300) for record in cycle(k)]
+    seen = np.array([record[0] for record in frames])
+    for begun in rng.uniform(0, 3e9, 12).astype(int):
+        late = (seen >= begun) & (seen < begun + int(rng.uniform(5 * MS, 30 * MS)))
+        seen[late] = seen[late].max(initial=0)
+    records = [(int(at), *record[1:]) for at, record in zip(np.maximum.accumulate(seen), frames, strict=True)]
+    block = decoded(layout(**BEGIN, counter="N"), records, cuts)
+    assert (len(block), block.incomplete, block.missing) == (300, 0, 0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("cuts", [(), tuple(range(1, 800))])
+def test_frames_lost_in_a_row_never_mix_two_cycles(seed: int, cuts: Sequence[int]) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [record for k in range(200) for record in cycle(k)]
+    lost: set[int] = set()
+    for begun in rng.integers(0, len(frames), 12):
+        lost |= set(range(begun, begun + rng.integers(1, 8)))
+    records = [record for i, record in enumerate(frames) if i not in lost]
+    whole = [k for k in range(200) if not lost & {3 * k, 3 * k + 1, 3 * k + 2}]
+    block = decoded(layout(**BEGIN, counter="N", time_stamp=STAMP), records, cuts)
+    assert set(block.counter.tolist()) <= set(whole)
+    assert block.readings[:, 0].tolist() == [k % 100 for k in block.counter.tolist()]
+    assert block.time_ns.tolist() == [block.time_ns[0] + 10 * MS * (k - block.counter[0]) for k in block.counter]
+    assert len(block) >= len(whole) - 2  # those at the end wait for begins that never come
+
+
 @pytest.mark.parametrize("cuts", CUTS)
 @pytest.mark.parametrize(
     ("lost", "incomplete"), [(["Time"], 1), (["Count"], 1), (["Acc"], 1), (["Time", "Count"], 1), (["Count", "Acc"], 1)]
