@@ -16,7 +16,7 @@ import can
 import numpy as np
 import pytest
 
-from tests.devices.canopen_node import MappedNode
+from tests.canopen_node import MappedNode
 from triaxcal_drivers.catalogue import BUILT_IN, parse_bundle
 from triaxcal_drivers.errors import ProfileError
 from triaxcald.recording.reader import Recording
