@@ -224,6 +224,9 @@ class ModbusDecoder:
     def _cycles(self, replies: _Replies) -> tuple[tuple[_Replies, _Replies], Bytes, int]:
         """The first and the last reply of each whole cycle, the bytes of all its
         replies (n, bytes), and the number of cycles that are not whole."""
+        if len(self._parts) == 1:  # each good reply is a whole cycle
+            whole = replies[~replies.failed] if replies.failed.any() else replies
+            return (whole, whole), whole.data, 0
         held = replies if self._open is None else self._open.followed_by(replies)
         self._open = None
         good = ~held.failed
@@ -260,6 +263,8 @@ class ModbusDecoder:
 
     def _fresh(self, first: _Replies, host_ns: Ints) -> NDArray[np.bool_]:
         """Whether the lasting values of each sample are new enough for it."""
+        if not self._lasting:
+            return np.ones(len(host_ns), dtype=bool)
         most_ns = np.array([round((read.latest_s or 0.0) * 1e9) for read in self._lasting], np.int64)
         return np.asarray((host_ns[:, None] - first.latest_ns <= most_ns).all(axis=1))
 

@@ -357,3 +357,13 @@ def test_the_order_of_bytes_and_words_holds_in_every_request():
     block = decoder(made).feed(batch)
     assert block.readings.tolist() == [[70_000, -2, 3]]
     assert block.channels["temp_c"].tolist() == [-70_001]
+
+
+@pytest.mark.parametrize("stream", ["", "max_gap = 0"])
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_records_without_a_whole_reply_are_no_samples(stream, order):
+    block = decoder(bundle(stream, more=f'byte_order = "{order}"')).feed(
+        RawBatch.of([record("X", 0, 0), record("x!", 0, 1)])
+    )
+    assert (len(block), block.errors, block.incomplete) == (0, 2, 0)
+    assert block.readings.shape == (0, 3)
