@@ -116,8 +116,10 @@ class SampleRate:
 
     @property
     def bursts(self) -> Any:
-        """As of `tc.SampleTimes.bursts`."""
-        return self._times.bursts()
+        """As of `tc.SampleTimes.bursts`, with those that it holds back."""
+        times = deepcopy(self._times)
+        times.finish()
+        return times.bursts()
 
     def wrong_hz(self) -> float | None:
         """The real rate, where it is not the declared one."""

@@ -97,6 +97,9 @@ ALPHA = 1 / 8
 averaged over some eight bursts."""
 BETA = ALPHA**2 / 4
 """Share by which it corrects the period: a loop without overshoot."""
+SHORTEST_S = 0.01
+"""Time between two corrections, a tenth of a window: shorter bursts are taken
+together."""
 AHEAD = 2
 """Bursts after one that show whether it was delayed or samples are lost: a host that is
 late catches up with the next, or the one after."""
@@ -304,23 +307,44 @@ class SampleTimes:
         begins = np.concatenate([[0], ends[:-1] + 1])
         endless = np.flatnonzero(time_ns[ends] - time_ns[begins] > ENDLESS * self._pause_ns)
         whole = int(endless[0]) if len(endless) else len(ends) - (0 if self._ended else 1)
-        until = whole if len(endless) or self._ended else whole - AHEAD
+        ends = self._apart(time_ns, ends[:whole])
+        settled = len(endless) > 0 or self._ended
         bursts = list(zip(np.diff(ends, prepend=-1).tolist(), time_ns[ends].tolist(), strict=True))
         laid = []
+        until = len(ends) if settled else len(ends) - AHEAD
         for i in range(until):
             n, at_ns = bursts[i]
-            if (before_ns := self._came_ns if i == 0 else bursts[i - 1][1]) is not None:
-                self._note(n, at_ns - before_ns)
-            if i + 1 == len(ends):  # the last of the stream, of which a part may be cut off
+            if i + 1 == len(ends) and not len(endless):  # the last of the stream, of which a part may be cut off
                 laid.append(line.go_on(n, line.last_ns, n * line.period_ns))
             else:
-                laid.append(line.lay(bursts[i : min(i + 1 + AHEAD, whole)], follow=at_ns > self._learned_ns))
+                laid.append(line.lay(bursts[i : i + 1 + AHEAD], follow=at_ns > self._learned_ns))
         if until > 0:
+            self._note_all(time_ns[: ends[until - 1] + 1])
             self._settle(int(ends[until - 1]) + 1)
         if len(endless):  # the stream comes evenly from now on
             self._line, self._period_ns = None, line.period_ns
             return laid
         return laid or None
+
+    def _apart(self, time_ns: Ints, ends: Ints) -> Ints:
+        """Those of the ``ends`` of bursts that are far enough apart to correct the
+        line, and the last of the stream."""
+        end_ns, kept, at_ns = time_ns[ends], [], self._came_ns
+        while (at := 0 if at_ns is None else int(np.searchsorted(end_ns, at_ns + SHORTEST_S * 1e9))) < len(ends):
+            kept.append(at)
+            at_ns = int(end_ns[at])
+        if len(ends) and (self._ended and (not kept or kept[-1] < len(ends) - 1)):
+            kept.append(len(ends) - 1)
+        return ends[kept] if kept else NONE
+
+    def _note_all(self, time_ns: Ints) -> None:
+        """The bursts that end in ``time_ns``."""
+        before_ns = time_ns[0] if self._came_ns is None else self._came_ns
+        ends = np.append(np.flatnonzero(np.diff(time_ns) > self._pause_ns / APART), len(time_ns) - 1)
+        sizes, every = np.diff(ends, prepend=-1), np.diff(time_ns[ends], prepend=before_ns)
+        for counts, values in ((self._together, sizes), (self._every_ms, np.rint(every * 1e-6).astype(int))):
+            values, times = np.unique(values[(sizes > 1) & (every > 0)], return_counts=True)
+            counts.update(dict(zip(values.tolist(), times.tolist(), strict=True)))
 
     def _evenly(self) -> list[Ints] | None:
         """Times as they are, but for those that make up for a pause."""
