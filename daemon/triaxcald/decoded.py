@@ -30,8 +30,7 @@ _CALLED = {
 
 
 READING_MOST = 1e100
-"""As `tc.poses.READING_MOST`, whose room loads scipy: a command that decodes alone does
-without."""
+"""As `tc.poses.READING_MOST`."""
 
 
 def only_finite(block: td.SampleBlock) -> td.SampleBlock:
@@ -77,7 +76,7 @@ class SampleRate:
     """Counter and time of the last sample."""
     _last_host_ns: int | None = None
     _last_laid_ns: int | None = None
-    _times: tc.SampleTimes = field(default_factory=lambda: tc.SampleTimes())
+    _times: tc.poses.SampleTimes = field(default_factory=lambda: tc.poses.SampleTimes())
     _steps: Counter[int] = field(default_factory=Counter)
 
     @property
@@ -116,7 +115,7 @@ class SampleRate:
 
     @property
     def bursts(self) -> Any:
-        """As of `tc.SampleTimes.bursts`, with those that it holds back."""
+        """As of `tc.poses.SampleTimes.bursts`, with those that it holds back."""
         times = deepcopy(self._times)
         times.finish()
         return times.bursts()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.model.arrivals import Bursts, SampleTimes
+from triaxcal.poses.arrivals import Bursts, SampleTimes
 
 
 def nanoseconds(times_s: Floats) -> Ints:
