@@ -199,6 +199,7 @@ BURSTS_REPORTED, SHARE_REPORTED = 8, 0.2
 """Bursts, and the share of the stream in them, from which they are reported: a few
 stalls of a host are none."""
 NONE = np.zeros(0, dtype=np.int64)
+"""No samples."""
 
 
 @dataclass
