@@ -114,7 +114,7 @@ class SampleRate:
         self._steps.update(dict(zip(bins.tolist(), count.tolist(), strict=True)))
 
     @property
-    def bursts(self) -> Any:
+    def bursts(self) -> tuple[int, float] | None:
         """As of `tc.poses.SampleTimes.bursts`, with those that it holds back."""
         times = deepcopy(self._times)
         times.finish()
@@ -201,7 +201,7 @@ class DecodedStream:
         each. The metrology is loaded only where there is anything to say of them."""
         found = [f"rate: {rate}"] if (rate := self.wrong_rate()) else []
         if (bursts := self._rate.bursts) is not None:
-            found.append(tc.text.quality_line(tc.poses.Bursts(bursts.samples, bursts.period_s)))
+            found.append(tc.text.quality_line(tc.poses.Bursts(*bursts)))
         if self.counts["samples"] >= RATE_LEAST and (dead := np.flatnonzero(self._low == self._high)).size:
             found.append(tc.text.quality_line(tc.poses.StuckOutput(tuple("xyz"[i] for i in dead), None, ())))
         return found

@@ -90,6 +90,10 @@ def _in_bursts(time_ns: Ints) -> float:
     return pause_ns if step[pauses].max() < step[pauses].sum() * 2 / 3 else 0.0
 
 
+STALL_S = 1.0
+"""Longest pause that later samples are expected to make up for, also where the end of
+the stream cuts them off."""
+
 # The line that the ends of bursts correct.
 
 ALPHA = 1 / 8
@@ -130,24 +134,21 @@ class _Line:
         ends = self.last_ns + self.period_ns * np.cumsum([n for n, _ in bursts])
         return [at_ns - float(end) for (_, at_ns), end in zip(bursts, ends, strict=True)]
 
-    def lay(self, bursts: list[tuple[int, int]], *, follow: bool) -> Ints:
-        """Times of the samples of the first burst, in view of those after it."""
+    def lay(self, bursts: list[tuple[int, int]], *, follow: bool, last: bool) -> Ints:
+        """Times of the samples of the first burst, in view of those after it. Of the
+        ``last`` of a stream a part may be cut off."""
         n, late = bursts[0][0], self.late_ns(bursts)
         most_ns = GAP * self.period_ns + self.usual_ns / 2
         limit_ns = LOST * self.period_ns + min(SCATTER * self.scatter_ns, most_ns)
         begin_ns, span_ns = self.last_ns, n * self.period_ns
-        if min(late) > limit_ns:  # samples are lost
+        if min(late) > limit_ns + last * STALL_S * 1e9:  # samples are lost
             begin_ns += min(late)
-        elif follow:
+        elif follow and not last:
             error = min(max(late[0], -limit_ns), limit_ns)
             self.scatter_ns += ALPHA * (min(abs(late[0]), span_ns) - self.scatter_ns)
             self.period_ns += BETA * error / n
             # A line that runs ahead of what has come is wrong at once.
             span_ns = max(span_ns + ALPHA * error + min(late[0] + limit_ns, 0.0) / 2, span_ns / 4)
-        return self.go_on(n, begin_ns, span_ns)
-
-    def go_on(self, n: int, begin_ns: float, span_ns: float) -> Ints:
-        """Times of ``n`` samples that are laid evenly."""
         self.last_ns = begin_ns + span_ns
         return np.rint(begin_ns + span_ns * np.arange(1, n + 1) / n).astype(np.int64)
 
@@ -173,8 +174,6 @@ def _line_of(bursts: list[tuple[int, int]]) -> _Line:
 
 # Pauses in a stream that comes evenly otherwise.
 
-STALL_S = 1.0
-"""Longest pause that later samples are expected to make up for."""
 MADE_UP_LEAST = 3
 """Samples that make up for a pause: a pair may be two delays by chance."""
 CAUGHT_UP = 0.5
@@ -183,16 +182,6 @@ SLOW, SLOW_LEAST = 0.9, 8
 """Samples at this many periods or more make up for nothing, once there are so many."""
 LONGEST = 10.0
 """They make up for a pause within so many times as many samples as it lacks."""
-
-
-@dataclass(frozen=True)
-class Bursts:
-    """Samples that come together: ``samples`` every ``period_s``, the medians, and
-    the number of bursts."""
-
-    samples: int
-    period_s: float
-    bursts: int
 
 
 BURSTS_REPORTED, SHARE_REPORTED = 8, 0.2
@@ -239,12 +228,13 @@ class SampleTimes:
         self._ended = True
         return self._settled()
 
-    def bursts(self) -> Bursts | None:
-        """The bursts so far, where they are more than a few."""
+    def bursts(self) -> tuple[int, float] | None:
+        """Samples in a burst, and seconds from one to the next, the medians; None where
+        there are only a few bursts so far."""
         count = sum(self._together.values())
         if count < BURSTS_REPORTED or sum(n * k for n, k in self._together.items()) < SHARE_REPORTED * self.samples:
             return None
-        return Bursts(_median(self._together), _median(self._every_ms) * 1e-3, count)
+        return _median(self._together), _median(self._every_ms) * 1e-3
 
     def _settled(self) -> Ints:
         """Times of all samples that can be laid, strictly increasing."""
@@ -314,11 +304,9 @@ class SampleTimes:
         laid = []
         until = len(ends) if settled else len(ends) - AHEAD
         for i in range(until):
-            n, at_ns = bursts[i]
-            if i + 1 == len(ends) and not len(endless):  # the last of the stream, of which a part may be cut off
-                laid.append(line.go_on(n, line.last_ns, n * line.period_ns))
-            else:
-                laid.append(line.lay(bursts[i : i + 1 + AHEAD], follow=at_ns > self._learned_ns))
+            at_ns = bursts[i][1]
+            last = i + 1 == len(ends) and not len(endless)
+            laid.append(line.lay(bursts[i : i + 1 + AHEAD], follow=at_ns > self._learned_ns, last=last))
         if until > 0:
             self._note_all(time_ns[: ends[until - 1] + 1])
             self._settle(int(ends[until - 1]) + 1)

@@ -110,5 +110,5 @@ class PoseFinder:
         if self._findings is None:
             self._findings = self._quality.findings(self.windows, self.spans())
             if (bursts := self._times.bursts()) is not None:
-                self._findings.append(Bursts(bursts.samples, bursts.period_s))
+                self._findings.append(Bursts(*bursts))
         return self._findings
