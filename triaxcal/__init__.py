@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from triaxcal.arrays import Floats, Ints
     from triaxcal.documents import Calibration
     from triaxcal.errors import InvalidData, MissingChannel, Refused, TooShort, TriaxcalError
-    from triaxcal.model.arrivals import SampleTimes
     from triaxcal.model.gravity import HEIGHTS_M, local_gravity_g
     from triaxcal.model.samples import Moment, Samples
     from triaxcal.model.sensor import Sensor
@@ -113,7 +112,6 @@ _NAMES = {
         "TooShort",
         "TriaxcalError",
     ),
-    "model.arrivals": ("SampleTimes",),
     "model.gravity": (
         "HEIGHTS_M",
         "local_gravity_g",
@@ -144,7 +142,6 @@ __all__ = [
     "Pose",
     "Poses",
     "Refused",
-    "SampleTimes",
     "Samples",
     "Sensor",
     "Stage",

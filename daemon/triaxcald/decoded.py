@@ -30,8 +30,7 @@ _CALLED = {
 
 
 READING_MOST = 1e100
-"""As `tc.poses.READING_MOST`, whose room loads scipy: a command that decodes alone does
-without."""
+"""As `tc.poses.READING_MOST`."""
 
 
 def only_finite(block: td.SampleBlock) -> td.SampleBlock:
@@ -77,7 +76,7 @@ class SampleRate:
     """Counter and time of the last sample."""
     _last_host_ns: int | None = None
     _last_laid_ns: int | None = None
-    _times: tc.SampleTimes = field(default_factory=lambda: tc.SampleTimes())
+    _times: tc.poses.SampleTimes = field(default_factory=lambda: tc.poses.SampleTimes())
     _steps: Counter[int] = field(default_factory=Counter)
 
     @property
@@ -115,9 +114,11 @@ class SampleRate:
         self._steps.update(dict(zip(bins.tolist(), count.tolist(), strict=True)))
 
     @property
-    def bursts(self) -> Any:
-        """As of `tc.SampleTimes.bursts`."""
-        return self._times.bursts()
+    def bursts(self) -> tuple[int, float] | None:
+        """As of `tc.poses.SampleTimes.bursts`, with those that it holds back."""
+        times = deepcopy(self._times)
+        times.finish()
+        return times.bursts()
 
     def wrong_hz(self) -> float | None:
         """The real rate, where it is not the declared one."""
@@ -200,7 +201,7 @@ class DecodedStream:
         each. The metrology is loaded only where there is anything to say of them."""
         found = [f"rate: {rate}"] if (rate := self.wrong_rate()) else []
         if (bursts := self._rate.bursts) is not None:
-            found.append(tc.text.quality_line(tc.poses.Bursts(bursts.samples, bursts.period_s)))
+            found.append(tc.text.quality_line(tc.poses.Bursts(*bursts)))
         if self.counts["samples"] >= RATE_LEAST and (dead := np.flatnonzero(self._low == self._high)).size:
             found.append(tc.text.quality_line(tc.poses.StuckOutput(tuple("xyz"[i] for i in dead), None, ())))
         return found

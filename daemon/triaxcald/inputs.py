@@ -101,7 +101,8 @@ def measure(
             moments.feed(samples.readings, samples.channels.get(tc.effects.TEMPERATURE))
     except tc.InvalidData as e:
         raise InputError(f"{name}: {e}") from e
-    counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
+    counted = {"rate": table.wrong_rate} if table.wrong_rate else {}
+    counted |= {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
     read = Measured(
         name, [], finder.windows, [], output_unit=table.output_unit, remarks=table.remarks, too_short=finder.too_short()
     )

@@ -213,3 +213,29 @@ def test_a_document_that_json_would_let_pass_or_choke_on_is_refused(text: str, w
 
 def test_a_whole_surrogate_pair_is_a_character() -> None:
     assert parse_document(b'{"a": "\\ud83d\\ude00"}', where="a.json") == {"a": "\U0001f600"}
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "is_wrong"),
+    [
+        ("t_s", lambda i: i / 100, False),
+        ("t_s", lambda i: i / 95, False),
+        ("t_s", lambda i: i / 112, True),
+        ("t_s", lambda i: i / 70, True),
+        ("t_s", lambda i: i // 20 * 20 / 130, True),  # of a batch, all samples bear its time
+        ("t_s", lambda i: i // 25 * 25 / 100, False),
+        ("time [ms]", lambda i: 1000 * i / 130, True),
+        ("t_s", lambda i: i, False),  # an index
+        ("sample", lambda i: i, False),
+    ],
+)
+def test_times_that_contradict_the_rate_that_is_given_are_said(
+    header: str, times: Callable[[int], float], is_wrong: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.csv"
+    lines = _csv().splitlines()[1:1201]
+    rows = [f"{times(i):.6f},{','.join(line.split(',')[1:4])}" for i, line in enumerate(lines)]
+    path.write_text("\n".join([f"{header},ux,uy,uz", *rows]))
+    found = {q.split(":")[0]: q for q in measure(str(path), reading=Reading(rate=100.0)).data_quality}
+    assert ("rate" in found) == is_wrong
+    assert "bursts" not in found, "they are counted at the rate"

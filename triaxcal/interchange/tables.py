@@ -12,8 +12,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData, MissingChannel
-from triaxcal.model.arrivals import RATE_SAMPLES
 from triaxcal.model.samples import Samples
+from triaxcal.poses.arrivals import RATE_SAMPLES
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
 """Nanoseconds in a unit of time (SI prefixes)."""

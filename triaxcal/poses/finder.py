@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData, TooShort
-from triaxcal.model.arrivals import SampleTimes
+from triaxcal.poses.arrivals import SampleTimes
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import QualityDetector, QualityFinding, faulty_poses
 from triaxcal.poses.quality.finding import Bursts
@@ -20,7 +20,7 @@ from triaxcal.poses.stillness.windows import Windows, require_finite
 class PoseFinder:
     """Finds the still poses of a stream, and faults of its samples. Samples that came
     in bursts are laid at the times at which they were taken
-    (`triaxcal.model.arrivals`).
+    (`triaxcal.poses.arrivals`).
 
     The blocks may have any size: the result is that of the whole. ``turn_s`` is the
     shortest duration of an in-place rotation, where the unit may turn so, as in
@@ -110,5 +110,5 @@ class PoseFinder:
         if self._findings is None:
             self._findings = self._quality.findings(self.windows, self.spans())
             if (bursts := self._times.bursts()) is not None:
-                self._findings.append(Bursts(bursts.samples, bursts.period_s))
+                self._findings.append(Bursts(*bursts))
         return self._findings

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import triaxcal as tc
 import triaxcal_drivers as td
+from triaxcald.decoded import SampleRate
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import MOSTLY, Column
@@ -102,6 +103,28 @@ def timing_of(
         index = next(iter(counters), None)
         return Timing(None, None, f"{tc.number_format.plain(rate, 6)} Hz by {where}", rate, index)
     return _timed(grid, candidates, names, time_unit, chosen)
+
+
+def _wrong_rate(
+    grid: Grid, roles: Roles, names: Sequence[Name], chosen: NDArray[np.bool_], rows: NDArray[np.intp], rate: float
+) -> str:
+    """By the times of a column, of samples that are counted at the user's ``rate``
+    instead; empty where no column tells, or it tells the same."""
+    columns = [] if TIME in roles.said else [i for i in roles.time if _rises_at_all(grid.columns[i], chosen)]
+    try:
+        timing = _timed(grid, columns, names, "s" if grid.is_native else None, chosen) if columns else None
+        if timing is None or timing.time_ns is None:
+            return ""
+        if grid.is_native:
+            clock.require_seconds(timing.time_ns[rows], "t_s")
+    except Unclear:
+        return ""
+    time_ns, real = np.maximum.accumulate(timing.time_ns[rows]), SampleRate(rate)
+    real.received(time_ns)
+    real.decoded(np.arange(len(rows)), time_ns)
+    if (rate_hz := real.wrong_hz()) is None:
+        return ""
+    return f"{rate_hz:.3g} Hz by the times, and --rate says {tc.number_format.plain(rate, 6)}"
 
 
 def _no_time(grid: Grid, roles: Roles, by_index: bool) -> str:
@@ -553,12 +576,14 @@ class Table:
     """``remarks`` say what was guessed and what was left out, a line each;
     ``output_unit`` is what the header says. ``beside`` are the cells (n,) of
     the columns that are neither outputs nor channels, by name, and of the
-    time."""
+    time. ``wrong_rate`` says how far the times are off the rate that the user
+    gives."""
 
     samples: CsvSamples
     remarks: tuple[str, ...] = ()
     output_unit: str = ""
     beside: Mapping[str, Any] = field(default_factory=dict)
+    wrong_rate: str = ""
 
 
 def read_table(name: str, reading: Reading | None = None, *, beside: bool = False) -> Table:
@@ -673,7 +698,8 @@ def _table_of(grid: Grid, reading: Reading, beside: bool, lacking: Sequence[int]
     remarks += [f"left out: {n} lines as '{td.hints.clipped(line)}'" for line, n in grid.passed_over.items()]
     output_unit = _output_unit([names[i].unit for i in roles.outputs])
     kept = _beside(grid, roles, samples.channels, rows[once]) if beside else {}
-    return Table(samples, (*remarks, *skipped), output_unit, kept)
+    wrong = _wrong_rate(grid, roles, names, chosen, rows, reading.rate) if reading.rate is not None else ""
+    return Table(samples, (*remarks, *skipped), output_unit, kept, wrong)
 
 
 def _by_number(grid: Grid, chosen: NDArray[np.bool_]) -> str:

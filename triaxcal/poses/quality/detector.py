@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.model.arrivals import RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
+from triaxcal.poses.arrivals import RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import faults, mains
 from triaxcal.poses.quality.faults import CellKeeper, Gaps, RunLengths, StepEstimator

@@ -21,7 +21,7 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.errors import TooShort
-from triaxcal.model.arrivals import RATE_LEAST
+from triaxcal.poses.arrivals import RATE_LEAST
 from triaxcal.poses.stillness.vibration import (
     ALONE_S,
     MOVE_SIGMA,

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 
 from triaxcal.arrays import READING_MOST, Bools, Floats, Ints, joined
 from triaxcal.errors import InvalidData
-from triaxcal.model.arrivals import GAP, RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
+from triaxcal.poses.arrivals import GAP, RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 
 WINDOW_S = 0.1
 """Short beside a pose and a move, so that edges cost little; long beside a

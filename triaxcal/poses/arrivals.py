@@ -90,6 +90,10 @@ def _in_bursts(time_ns: Ints) -> float:
     return pause_ns if step[pauses].max() < step[pauses].sum() * 2 / 3 else 0.0
 
 
+STALL_S = 1.0
+"""Longest pause that later samples are expected to make up for, also where the end of
+the stream cuts them off."""
+
 # The line that the ends of bursts correct.
 
 ALPHA = 1 / 8
@@ -97,6 +101,9 @@ ALPHA = 1 / 8
 averaged over some eight bursts."""
 BETA = ALPHA**2 / 4
 """Share by which it corrects the period: a loop without overshoot."""
+SHORTEST_S = 0.01
+"""Time between two corrections, a tenth of a window: shorter bursts are taken
+together."""
 AHEAD = 2
 """Bursts after one that show whether it was delayed or samples are lost: a host that is
 late catches up with the next, or the one after."""
@@ -127,24 +134,21 @@ class _Line:
         ends = self.last_ns + self.period_ns * np.cumsum([n for n, _ in bursts])
         return [at_ns - float(end) for (_, at_ns), end in zip(bursts, ends, strict=True)]
 
-    def lay(self, bursts: list[tuple[int, int]], *, follow: bool) -> Ints:
-        """Times of the samples of the first burst, in view of those after it."""
+    def lay(self, bursts: list[tuple[int, int]], *, follow: bool, last: bool) -> Ints:
+        """Times of the samples of the first burst, in view of those after it. Of the
+        ``last`` of a stream a part may be cut off."""
         n, late = bursts[0][0], self.late_ns(bursts)
         most_ns = GAP * self.period_ns + self.usual_ns / 2
         limit_ns = LOST * self.period_ns + min(SCATTER * self.scatter_ns, most_ns)
         begin_ns, span_ns = self.last_ns, n * self.period_ns
-        if min(late) > limit_ns:  # samples are lost
+        if min(late) > limit_ns + last * STALL_S * 1e9:  # samples are lost
             begin_ns += min(late)
-        elif follow:
+        elif follow and not last:
             error = min(max(late[0], -limit_ns), limit_ns)
             self.scatter_ns += ALPHA * (min(abs(late[0]), span_ns) - self.scatter_ns)
             self.period_ns += BETA * error / n
             # A line that runs ahead of what has come is wrong at once.
             span_ns = max(span_ns + ALPHA * error + min(late[0] + limit_ns, 0.0) / 2, span_ns / 4)
-        return self.go_on(n, begin_ns, span_ns)
-
-    def go_on(self, n: int, begin_ns: float, span_ns: float) -> Ints:
-        """Times of ``n`` samples that are laid evenly."""
         self.last_ns = begin_ns + span_ns
         return np.rint(begin_ns + span_ns * np.arange(1, n + 1) / n).astype(np.int64)
 
@@ -170,8 +174,6 @@ def _line_of(bursts: list[tuple[int, int]]) -> _Line:
 
 # Pauses in a stream that comes evenly otherwise.
 
-STALL_S = 1.0
-"""Longest pause that later samples are expected to make up for."""
 MADE_UP_LEAST = 3
 """Samples that make up for a pause: a pair may be two delays by chance."""
 CAUGHT_UP = 0.5
@@ -182,20 +184,11 @@ LONGEST = 10.0
 """They make up for a pause within so many times as many samples as it lacks."""
 
 
-@dataclass(frozen=True)
-class Bursts:
-    """Samples that come together: ``samples`` every ``period_s``, the medians, and
-    the number of bursts."""
-
-    samples: int
-    period_s: float
-    bursts: int
-
-
 BURSTS_REPORTED, SHARE_REPORTED = 8, 0.2
 """Bursts, and the share of the stream in them, from which they are reported: a few
 stalls of a host are none."""
 NONE = np.zeros(0, dtype=np.int64)
+"""No samples."""
 
 
 @dataclass
@@ -235,12 +228,13 @@ class SampleTimes:
         self._ended = True
         return self._settled()
 
-    def bursts(self) -> Bursts | None:
-        """The bursts so far, where they are more than a few."""
+    def bursts(self) -> tuple[int, float] | None:
+        """Samples in a burst, and seconds from one to the next, the medians; None where
+        there are only a few bursts so far."""
         count = sum(self._together.values())
         if count < BURSTS_REPORTED or sum(n * k for n, k in self._together.items()) < SHARE_REPORTED * self.samples:
             return None
-        return Bursts(_median(self._together), _median(self._every_ms) * 1e-3, count)
+        return _median(self._together), _median(self._every_ms) * 1e-3
 
     def _settled(self) -> Ints:
         """Times of all samples that can be laid, strictly increasing."""
@@ -304,23 +298,42 @@ class SampleTimes:
         begins = np.concatenate([[0], ends[:-1] + 1])
         endless = np.flatnonzero(time_ns[ends] - time_ns[begins] > ENDLESS * self._pause_ns)
         whole = int(endless[0]) if len(endless) else len(ends) - (0 if self._ended else 1)
-        until = whole if len(endless) or self._ended else whole - AHEAD
+        ends = self._apart(time_ns, ends[:whole])
+        settled = len(endless) > 0 or self._ended
         bursts = list(zip(np.diff(ends, prepend=-1).tolist(), time_ns[ends].tolist(), strict=True))
         laid = []
+        until = len(ends) if settled else len(ends) - AHEAD
         for i in range(until):
-            n, at_ns = bursts[i]
-            if (before_ns := self._came_ns if i == 0 else bursts[i - 1][1]) is not None:
-                self._note(n, at_ns - before_ns)
-            if i + 1 == len(ends):  # the last of the stream, of which a part may be cut off
-                laid.append(line.go_on(n, line.last_ns, n * line.period_ns))
-            else:
-                laid.append(line.lay(bursts[i : min(i + 1 + AHEAD, whole)], follow=at_ns > self._learned_ns))
+            at_ns = bursts[i][1]
+            last = i + 1 == len(ends) and not len(endless)
+            laid.append(line.lay(bursts[i : i + 1 + AHEAD], follow=at_ns > self._learned_ns, last=last))
         if until > 0:
+            self._note_all(time_ns[: ends[until - 1] + 1])
             self._settle(int(ends[until - 1]) + 1)
         if len(endless):  # the stream comes evenly from now on
             self._line, self._period_ns = None, line.period_ns
             return laid
         return laid or None
+
+    def _apart(self, time_ns: Ints, ends: Ints) -> Ints:
+        """Those of the ``ends`` of bursts that are far enough apart to correct the
+        line, and the last of the stream."""
+        end_ns, kept, at_ns = time_ns[ends], [], self._came_ns
+        while (at := 0 if at_ns is None else int(np.searchsorted(end_ns, at_ns + SHORTEST_S * 1e9))) < len(ends):
+            kept.append(at)
+            at_ns = int(end_ns[at])
+        if len(ends) and (self._ended and (not kept or kept[-1] < len(ends) - 1)):
+            kept.append(len(ends) - 1)
+        return ends[kept] if kept else NONE
+
+    def _note_all(self, time_ns: Ints) -> None:
+        """The bursts that end in ``time_ns``."""
+        before_ns = time_ns[0] if self._came_ns is None else self._came_ns
+        ends = np.append(np.flatnonzero(np.diff(time_ns) > self._pause_ns / APART), len(time_ns) - 1)
+        sizes, every = np.diff(ends, prepend=-1), np.diff(time_ns[ends], prepend=before_ns)
+        for counts, values in ((self._together, sizes), (self._every_ms, np.rint(every * 1e-6).astype(int))):
+            values, times = np.unique(values[(sizes > 1) & (every > 0)], return_counts=True)
+            counts.update(dict(zip(values.tolist(), times.tolist(), strict=True)))
 
     def _evenly(self) -> list[Ints] | None:
         """Times as they are, but for those that make up for a pause."""

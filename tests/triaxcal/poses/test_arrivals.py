@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.model.arrivals import Bursts, SampleTimes
+from triaxcal.poses.arrivals import SampleTimes
 
 
 def nanoseconds(times_s: Floats) -> Ints:
@@ -28,7 +28,7 @@ def delivered(taken_s: Floats, every_s: float, jitter: float, seed: int) -> Floa
     return np.asarray(at_s[burst] + (np.arange(len(burst)) - np.searchsorted(burst, burst)) * 2e-5)
 
 
-def laid(arrival_ns: Ints, block: int = 10**9) -> tuple[Ints, Bursts | None]:
+def laid(arrival_ns: Ints, block: int = 10**9) -> tuple[Ints, tuple[int, float] | None]:
     times = SampleTimes()
     out = [times.feed(arrival_ns[at : at + block]) for at in range(0, len(arrival_ns), block)]
     return np.concatenate([*out, times.finish()]), times.bursts()
@@ -50,8 +50,8 @@ def test_bursts_are_laid_where_the_samples_were_taken(rate_hz: float, every_s: f
         off = time_ns * 1e-9 - taken
         assert np.ptp(off) < (jitter + 0.05) * every_s + 0.5 / rate_hz, "nearer than the bursts scatter"
         assert bursts is not None
-        assert bursts.samples == pytest.approx(every_s * rate_hz, abs=1)
-        assert bursts.period_s == pytest.approx(every_s, rel=0.1)
+        assert bursts[0] == pytest.approx(every_s * rate_hz, abs=1)
+        assert bursts[1] == pytest.approx(every_s, rel=0.1)
 
 
 @pytest.mark.parametrize("block", [1, 13, 997])
@@ -93,6 +93,14 @@ def test_lost_bursts_stay_gaps(jitter: float) -> None:
         assert (gaps == np.flatnonzero(np.diff(taken[~lost]) > 0.1)).all()
         missing = np.diff(time_ns)[gaps] * 1e-9 * 100 - 1
         assert missing == pytest.approx(25, abs=0.1 if not jitter else 10)
+
+
+@pytest.mark.parametrize("after_s", [0.25, 2.0])
+def test_a_long_gap_before_the_last_bursts_stays_one(after_s: float) -> None:
+    taken = np.concatenate([np.arange(3000) / 100, 100.0 + np.arange(int(after_s * 100)) / 100])
+    time_ns, _ = laid(nanoseconds(delivered(taken, 0.25, 0.0, 0)))
+    assert np.diff(time_ns * 1e-9).max() == pytest.approx(70.01, abs=0.3)
+    assert np.ptp(time_ns * 1e-9 - taken) < 0.3
 
 
 def test_a_host_that_stalls_now_and_then_delays_samples_and_loses_none() -> None:
