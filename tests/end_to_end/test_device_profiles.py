@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from tests.devices import vendors
+from tests import vendor_devices as vendors
 from tests.canopen_node import MappedNode
-from tests.devices.vendors import Sensor
+from tests.vendor_devices import Sensor
 from triaxcal_drivers.catalogue import BUILT_IN
 
 pytestmark = pytest.mark.slow
