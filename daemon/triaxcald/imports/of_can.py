@@ -117,6 +117,8 @@ class Selection:
 
     def streams_of(self, source: int, flags: int) -> list[str]:
         """The streams that use a frame."""
+        if self._groups and (source, flags & _EXTENDED) not in self._nodes:
+            self._meet((source, flags & _EXTENDED))
         return [] if flags & _ERROR else self._streams.get((source, flags & _EXTENDED), [])
 
     def is_reading(self, frame: td.logs.LoggedFrame) -> bool:

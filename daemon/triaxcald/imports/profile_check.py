@@ -310,6 +310,7 @@ def _looked_at(path: Path, source: _Source, found: _Found) -> LogOf:
         "seconds_by_log": None,
         "damaged": account.damaged,
         "damage": account.damage,
+        "unread_date": account.unread_date,
     }
     found.notes += remarks(detail, 0.0)
     return LogOf(
@@ -639,12 +640,9 @@ class _UnitRecording:
         streams: Mapping[str, Any] = self.bundle.profile.streams
         if self._driver != "modbus":
             return self.streams  # whose records nobody here knows
-        function, address = source >> 16, source & 0xFFFF
-        return [
-            name
-            for name, stream in streams.items()
-            if function == stream.function and stream.address <= address < stream.address + stream.words
-        ]
+        most = cast(Any, self.bundle.profile).max_read_words
+        reads = {name: stream.reads(most) for name, stream in streams.items()}
+        return [name for name, r in reads.items() if source in {read.source for read in (*r.of_sample, *r.lasting)}]
 
     def settle(self) -> None:
         if not any(self.streams_of(source, flags) for source, flags, _ in self._rows.of):
