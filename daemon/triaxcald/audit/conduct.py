@@ -38,6 +38,7 @@ from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
 from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
+from triaxcald.provision.correction import AT_START
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.manifest import is_manifest
@@ -337,7 +338,7 @@ class _Audit:
                 self._add(REPORT, Kind.NOT_DRAWN)
 
     def _check_registers(self, again: Again) -> None:
-        names = (REGISTERS_BEFORE, REGISTERS_EARLIER, REGISTERS_AFTER)
+        names = (AT_START, REGISTERS_BEFORE, REGISTERS_EARLIER, REGISTERS_AFTER)
         kept: dict[str, Mapping[str, bytes] | None] = {}
         for name in names:
             kept[name] = None
@@ -363,6 +364,7 @@ class _Audit:
             provisioned=self._check_events(again),
             rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
             cut_short=self._sealed_later,
+            at_start=kept[AT_START],
         )
         if again.written and not self._aborted and self._outcome and said.told is None:
             self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")

@@ -14,6 +14,7 @@ from triaxcald.audit.restart_probes import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import registers as snapshot
 from triaxcald.provision.access import Label
+from triaxcald.provision.correction import AT_START
 from triaxcald.provision.identity import serial_in
 from triaxcald.provision.registers import RegisterImage, calibration_registers, sanity_warnings
 from triaxcald.provision.restart_check import MISSED, SEQUENCES, may_probe, own_steps, writes_of
@@ -156,6 +157,8 @@ class Said:
     cut_short: bool = False
     """The recording ends before the run did, and the outcome tells nothing of what was
     written."""
+    at_start: Raw | None = None
+    """By which the device corrected the readings."""
 
     @property
     def old(self) -> Raw | None:
@@ -172,6 +175,7 @@ def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
     return [
         *([] if said.aborted else _identity(traffic, serial)),  # another unit may be why it was aborted
         *_asked_for(traffic, said),
+        *_at_start(said),
         *_before(traffic, said),
         *_after(traffic, said),
         *_told(traffic, said),
@@ -206,6 +210,14 @@ def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
         for name, raw in written
         if (name, raw) not in traffic.asked and (name, raw) not in steps
     ]
+
+
+def _at_start(said: Said) -> list[Difference]:
+    """What corrected the readings is what was read before the first write; an
+    interrupted provisioning may have left other values."""
+    if said.at_start is None or said.before is None or said.earlier is not None:
+        return []
+    return _unequal(AT_START, said.at_start, {name: said.before[name] for name in said.at_start if name in said.before})
 
 
 def _before(traffic: Traffic, said: Said) -> list[Difference]:
