@@ -126,6 +126,8 @@ class SampleRate:
             return None
         if abs(self._own_ns / self._host_ns - 1) > OFF:  # the host's clock tells
             rate_hz = self._samples / self._host_ns * 1e9
+        elif not self._steps:  # all are held back, since they come in bursts
+            return None
         else:
             both = (self._samples / self._own_ns * 1e9, 1e9 / self._median_step_ns())
             rate_hz = min(both, key=lambda hz: abs(np.log(hz / self.declared_hz)))

@@ -162,3 +162,12 @@ def test_a_stream_too_short_to_judge_has_no_wrong_rate() -> None:
     rate.received(time_ns)
     rate.decoded(np.arange(40), time_ns)
     assert rate.wrong_hz() is None
+
+
+@KINDS
+@pytest.mark.parametrize("seconds", [0.1, 0.9, 1.1, 2.3, 3.9, 4.2])
+@pytest.mark.parametrize("delivery", [evenly, in_bursts])
+def test_a_short_recording_is_judged_as_far_as_it_goes(bundle: Bundle, delivery: Delivery, seconds: float) -> None:
+    stream = DecodedStream(bundle, READINGS)
+    stream.feed(RawBatch.of(frames(100.0, 1, delivery, seconds=seconds)))
+    assert set(names(stream)) <= {"bursts"}
