@@ -84,11 +84,11 @@ class SampleRate:
         return max(SILENCE_S, SILENCE_PERIODS / self.declared_hz) * 1e9
 
     def received(self, host_ns: NDArray[np.int64]) -> None:
-        """Host times (n,) of raw records."""
+        """Host times (n,) at which samples came, or their raw records."""
         if not len(host_ns):
             return
         step = np.diff(host_ns, prepend=host_ns[0] if self._last_host_ns is None else self._last_host_ns)
-        step = step[(step > 0) & (step <= self._silence_ns)]
+        step = step[np.abs(step) <= self._silence_ns]
         self._host_ns += int(step.sum())
         self._longest_ns = max(self._longest_ns, int(step.max(initial=0)))
         self._last_host_ns = int(host_ns[-1])
@@ -222,8 +222,8 @@ class DecodedStream:
         if self._first_host_ns is None and len(batch):
             self._first_host_ns = int(batch.time_ns[0])
         self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & td.RawFlag.LOST_BEFORE))
-        self._rate.received(batch.time_ns)
         block = only_finite(self._decoder.feed(batch))
+        self._rate.received(batch.time_ns if block.arrival_ns is None else block.arrival_ns)
         self.two_senders = self.two_senders or block.two_senders
         for name in _PASSED_ON:
             self.counts[name] += getattr(block, name)

@@ -166,6 +166,8 @@ class SampleBlock:
     those whose readings are no finite numbers, all three of which are dropped;
     restarts of the device that its counter or stamps show, and nothing else had
     told. ``two_senders``: the latest records are those of two units.
+    ``arrival_ns`` (n,) host time at which each came, less its age in a FIFO, where
+    records may come without samples; else None.
     """
 
     time_ns: NDArray[np.int64]
@@ -181,6 +183,7 @@ class SampleBlock:
     restarts: int = 0
     malformed: int = 0
     two_senders: bool = False
+    arrival_ns: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -194,6 +197,7 @@ class SampleBlock:
             counter=self.counter[rows],
             readings=self.readings[rows],
             channels=channels,
+            arrival_ns=None if self.arrival_ns is None else self.arrival_ns[rows],
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import Workshop
+from tests.virtual_line import OnModbus, described
 from triaxcal_drivers.catalogue import load_bundle, parse_bundle
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
@@ -171,3 +174,21 @@ def test_a_short_recording_is_judged_as_far_as_it_goes(bundle: Bundle, delivery:
     stream = DecodedStream(bundle, READINGS)
     stream.feed(RawBatch.of(frames(100.0, 1, delivery, seconds=seconds)))
     assert set(names(stream)) <= {"bursts"}
+
+
+@pytest.mark.parametrize("size", [1, 10_000])
+def test_a_unit_that_dies_and_is_still_asked_has_no_wrong_rate(size: int, workshop: Workshop) -> None:
+    bundle = load_bundle(Path("triax-ref-modbus"))
+    device = OnModbus(described(workshop.device(speed=1.0)), bundle, None)
+    records = []
+    for _ in range(20):
+        asyncio.run(device.time_base.advance(1.0))
+        records += device.records([READINGS])
+    _, source, _, empty = device.records([READINGS])[-1]
+    assert not any(empty[:2]), "no samples"
+    records += [(records[-1][0] + 500_000_000 * i, source, 0, empty) for i in range(1, 100)]
+    stream = DecodedStream(bundle, READINGS)
+    for batch in cut(RawBatch.of(records), size):
+        stream.feed(batch)
+    assert stream.counts["samples"] > 1900
+    assert stream.faults() == []

@@ -341,6 +341,7 @@ class ModbusDecoder:
             invalid=int((fresh & ~valid).sum()),
             restarts=placed.restarts,
             two_senders=self._two_senders(records, stamp if counter is None else counter, a.host_ns, placed),
+            arrival_ns=a.host_ns[placed.new],
         )
         counts = fresh & valid
         return block if counts.all() else block.only(counts)
