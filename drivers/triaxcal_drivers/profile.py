@@ -9,6 +9,7 @@ names the nearest right one.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Discriminator, FailFast, Field, Tag, model_validator
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.hints import nearest
+from triaxcal_drivers.hints import clipped, nearest
 from triaxcal_drivers.registers import ASCII, RegisterKind
 from triaxcal_drivers.roles import (
     AXES,
@@ -184,15 +185,16 @@ class ReconnectStep(Strict):
 
 
 class SendStep(Strict):
-    send: Annotated[str, Field(pattern=r"^0x[0-9A-Fa-f]{1,8}$", description='identifier of the CAN frame: "0x050"')]
-    data: Annotated[
-        str,
-        Field(pattern=r"^([0-9A-Fa-f]{2}( ?[0-9A-Fa-f]{2}){0,7})?$", description='its bytes: "FF AA 03 09 00"'),
-    ] = ""
+    send: Annotated[str, Field(description='identifier of the CAN frame: "0x050"')]
+    data: Annotated[str, Field(description='its bytes, up to eight: "FF AA 03 09 00"')] = ""
     extended: Annotated[bool, Field(description="whether the identifier has 29 bits")] = False
 
     @model_validator(mode="after")
     def _on_the_bus(self) -> Self:
+        if not re.fullmatch("0x[0-9A-Fa-f]{1,8}", self.send):
+            raise ValueError(f'send: expected an identifier as in "0x050", not {clipped(repr(self.send))}')
+        if not re.fullmatch("([0-9A-Fa-f]{2} ?){0,8}", self.data):
+            raise ValueError(f'data: expected up to eight bytes as in "FF AA 03", not {clipped(repr(self.data))}')
         if self.identifier > (0x1FFFFFFF if self.extended else 0x7FF):
             hint = "" if self.extended or self.identifier > 0x1FFFFFFF else "; set extended = true"
             raise ValueError(f"send: {self.send} is no identifier of {29 if self.extended else 11} bits{hint}")

@@ -113,7 +113,8 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
     except ValidationError as e:
         errors = e.errors()
         first = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
-        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"])]
+        missing = first["type"] == "missing"  # then the last part is a key that the data lack
+        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"], missing=missing)]
         line = _line_of(text, path)
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
@@ -129,7 +130,7 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
         raise ProfileError(f"{where}{at}: {field}{message[0].lower()}{message[1:]}") from e
 
 
-def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
+def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...], *, missing: bool) -> bool:
     """Whether a part of pydantic's location is the name of a union member
     rather than a key of the data."""
     at = data
@@ -138,7 +139,7 @@ def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
             isinstance(at, (list, tuple)) and isinstance(p, int) and p < len(at)
         )
         if p is part and not inside:
-            return p is not loc[-1]
+            return p is not loc[-1] or not missing
         if inside:
             at = at[p]
     return False

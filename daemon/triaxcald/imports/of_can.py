@@ -65,8 +65,12 @@ class Selection:
         for name, layout in self.layouts.items():
             for key in dict.fromkeys(key for m in layout.messages for key in _identifiers(m)):
                 self._streams.setdefault(key, []).append(name)
-        self._readings = {key for key, names in self._streams.items() if td.READINGS in names}
-        counted = (m for layout in self.layouts.values() if layout.counters for m in layout.messages)
+        readings = self.layouts[td.READINGS]
+        self._samples = readings.messages[: readings.sample]  # what makes a sample; others are beside it
+        self._readings = {key for m in self._samples for key in _identifiers(m)}
+        counted = (
+            m for layout in self.layouts.values() if _is_counted(layout) for m in layout.messages[: layout.sample]
+        )
         self._counted = {key for m in counted for key in _identifiers(m)}
         self._seen: Counter[tuple[Key, str]] = Counter()
         self._strangers: Counter[int] = Counter()  # frames of other nodes than the one asked for
@@ -110,9 +114,10 @@ class Selection:
             return
         self._nodes[key] = source & 0xFF
         self._streams[key] = names
-        if td.READINGS in names:
+        if any(source & m.group[0] == m.group[1] for m in self._samples if m.j1939):
             self._readings.add(key)
-        if any(self.layouts[name].counters for name in names):
+        of = [self.layouts[name] for name in names if _is_counted(self.layouts[name])]
+        if any(source & m.group[0] == m.group[1] for o in of for m in o.messages[: o.sample] if m.j1939):
             self._counted.add(key)
 
     def streams_of(self, source: int, flags: int) -> list[str]:
@@ -178,6 +183,10 @@ class Selection:
     def from_channels(self) -> list[str]:
         """Those that the unit's frames came on."""
         return sorted({channel for _, channel in self._seen})
+
+
+def _is_counted(layout: td.can.Layout) -> bool:
+    return bool(layout.counters or layout.count)
 
 
 def _identifiers(message: td.can.Message) -> dict[Key, int | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -332,16 +333,22 @@ class _Stream:
         self._name, self._profile, self._timed = name, bundle.profile, timed
         self._pipeline = Pipeline(bundle, name)
         self._values: dict[str, tuple[float, float]] = {}
-        self._times = Times(1e9 / bundle.profile.sampling.rate_hz)
-        self._lead: int | None = None  # of a sample's frames, those with this source tell its time
+        self._period_ns = 1e9 / bundle.profile.sampling.rate_hz
+        self._times_of: dict[int, Times] = {}  # by source
+        self._counts: Counter[int] = Counter()
         self._closed = False
         self.frames = 0
 
+    @property
+    def _times(self) -> Times:
+        """Of the frames that come most often: those of slow channels tell less."""
+        (most,) = self._counts.most_common(1) or [(0, 0)]
+        return self._times_of.get(most[0], Times(self._period_ns))
+
     def note(self, time_ns: int, source: int) -> None:
         self.frames += 1
-        self._lead = source if self._lead is None else self._lead
-        if source == self._lead:
-            self._times.note(time_ns)
+        self._times_of.setdefault(source, Times(self._period_ns)).note(time_ns)
+        self._counts[source] += 1
 
     def feed(self, batch: td.RawBatch) -> None:
         block = self._pipeline.rising(batch)

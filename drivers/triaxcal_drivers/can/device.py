@@ -36,7 +36,6 @@ from triaxcal_drivers.two_senders import Answers, ExtraAnswer
 T = TypeVar("T")
 
 _NMT_START = 1
-_SYNC = 0x080
 _HEARTBEAT, _BOOTED = 0x700, b"\0"
 """CiA 301: a node sends a heartbeat of state 0 after booting."""
 _BOOT_LOOK_S = 0.1
@@ -263,7 +262,7 @@ class CanDevice:
         timeout_s = self._profile.sampling.silence_timeout_s
         deadline_s = now_s() + timeout_s
         asked = [p for name in names if (p := self._profile.streams[name].sync_period_s) is not None]
-        sync = asyncio.create_task(self._sync(min(asked))) if asked else None
+        sync = connection.line.sync(min(asked)) if asked else None
         try:
             while True:
                 batch = await frames.batch(min(deadline_s - now_s(), _BOOT_LOOK_S))
@@ -279,7 +278,7 @@ class CanDevice:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
             if sync is not None:
-                sync.cancel()
+                connection.line.unsync(sync)
             if frames.close(opened):
                 self._booted = None
                 connection.line.unhear(frames)
@@ -356,17 +355,6 @@ class CanDevice:
     async def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
         """Raises BusError."""
         await asyncio.to_thread(self._connected().line.send, identifier, data, extended=extended)
-
-    async def _sync(self, period_s: float) -> None:
-        """Send SYNC every ``period_s``, until cancelled. A dead bus is told by the
-        stream."""
-        loop = asyncio.get_running_loop()
-        next_s = loop.time()
-        while True:
-            with suppress(BusError):
-                await self.send(_SYNC, b"")
-            next_s = max(next_s + period_s, loop.time())
-            await asyncio.sleep(next_s - loop.time())
 
 
 def _on_the_wire(name: str) -> bytes:

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.adapter import Identifier
 from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
 from triaxcal_drivers.can.model import CanBus, CanProfile
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import nearest
 from triaxcal_drivers.interface import EXTENDED_KEY, LineLoad, RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import READING_CHANNELS, Bundle
-from triaxcal_drivers.timeline import Arrivals, Clockwork, Timeline, signed_steps
+from triaxcal_drivers.timeline import Arrivals, Clockwork, Placed, Timeline, signed_steps
 from triaxcal_drivers.two_senders import Senders, by_arrival, by_counter
 
 if TYPE_CHECKING:
@@ -102,8 +101,11 @@ class TogetherFromBegin:
         return bool(self._had)
 
 
+WAITED = 64
+"""Samples that are held until such begins come: where none does, somebody else sends
+the other messages."""
 BEGINS = 4
-"""Begins that are waited for where a message came later than a period after its
+"""Begins that are waited for where a message came later than half a period after its
 begin: either the next begin was lost, and the message is of the next sample, or the
 host was late. With more of them a device that is a tenth too fast looks as if none
 were lost."""
@@ -113,21 +115,22 @@ def _mixed(time_ns: Ints, is_begin: NDArray[np.bool_], sample: Ints, period_ns: 
     """Which samples (of parts in the order of ``sample``) may have messages of another
     one, and the first of which nobody knows yet; the number of samples without one.
 
-    A message within a period of its begin is of that sample. A later one is so too
-    where the begins that follow come so early that none of them can be missing.
+    A message within half a period of its begin is of that sample. A later one is so
+    too where the begins that follow come so early that none of them can be missing.
     """
     samples = int(sample[-1]) + 1 if len(sample) else 0
     mixed, unknown = np.zeros(samples, dtype=bool), samples
     begin_ns = np.full(samples, np.iinfo(np.int64).max)
     begin_ns[sample[is_begin]] = time_ns[is_begin]
     begun = np.flatnonzero(begin_ns < np.iinfo(np.int64).max)
-    late = np.unique(sample[time_ns - period_ns > begin_ns[sample]])
+    late = np.unique(sample[time_ns - period_ns / 2 > begin_ns[sample]])
     for number in late.tolist():
         after = begun[np.searchsorted(begun, number, side="right") :][:BEGINS]
         periods = (begin_ns[after] - begin_ns[number]) / period_ns
         if (periods < np.arange(1, len(after) + 1) + 0.5).any():
             continue
-        if len(after) < BEGINS:
+        waited = int(after[-1]) if len(after) == BEGINS else samples
+        if len(after) < BEGINS and waited - number <= WAITED:
             unknown = min(unknown, number)
         else:
             mixed[number] = True
@@ -217,11 +220,14 @@ class _Parts:
 @dataclass(frozen=True)
 class _Firsts:
     """Of each sample the part that came first: its host time, and its place among
-    all records; and whether records were lost before one of its parts."""
+    all records; whether records were lost before one of its parts; and how many such
+    gaps there were, and how many samples were given up, up to it."""
 
     time_ns: Ints
     order: Ints
     after_gap: NDArray[np.bool_]
+    gaps: Ints
+    given_up: Ints
 
     @classmethod
     def of(cls, parts: _Parts, row: Ints, rows: int) -> _Firsts:
@@ -231,10 +237,15 @@ class _Firsts:
         np.minimum.at(time_ns, row, parts.time_ns)
         np.minimum.at(order, row, parts.order)
         np.logical_or.at(after_gap, row, parts.after_gap)
-        return cls(time_ns, order, after_gap)
+        return cls.each(time_ns, order, after_gap)
+
+    @classmethod
+    def each(cls, time_ns: Ints, order: Ints, after_gap: NDArray[np.bool_]) -> _Firsts:
+        """Where none is given up."""
+        return cls(time_ns, order, after_gap, np.cumsum(after_gap), np.zeros(len(order), np.int64))
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> _Firsts:
-        return _Firsts(self.time_ns[rows], self.order[rows], self.after_gap[rows])
+        return _Firsts(self.time_ns[rows], self.order[rows], self.after_gap[rows], self.gaps[rows], self.given_up[rows])
 
 
 class _Beside:
@@ -341,7 +352,11 @@ class CanDecoder:
         )
         self._beside = _Beside(layout) if layout.latest_s else None
         self._timeline = _timeline(layout, self._period_ns)
-        self._given_up = 0  # samples that no counter has missed so far
+        stamp = layout.stamp
+        self._bridged_ns = 0.5e9 * stamp[2] * 2 ** min(stamp[1].length, _EXACT.bit_length()) if stamp else 0.0
+        self._given_up = self._given_up_at_last = 0  # samples so far, and at the last one that was placed
+        self._gaps_before = self._gaps_at_last_sample = 0  # of messages of samples, likewise
+        self._count: int | None = None  # of the last sample that was placed
         self._placed_ns = 0  # host time of the last sample that it placed
         self._order = 0  # records of the stream so far
         self._arrived = Arrived(len(self._columns))
@@ -419,9 +434,12 @@ class CanDecoder:
                     values[column, mine] = np.isin(signal.raw(data).astype(np.int64), allowed)
                 else:
                     values[column, mine] = signal.raw(data).astype(np.int64) & _EXACT
-            if self._layout.counters:
+            if self._layout.counters and number < self._layout.sample:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
-        after_gap = self._after_gap(batch, rows)
+        # A gap is that of the next message of a sample, not of one beside it.
+        of_sample = message < self._layout.sample
+        after_gap = np.zeros(len(rows), dtype=bool)
+        after_gap[of_sample] = self._after_gap(batch, rows[of_sample])
         order = self._order + np.arange(len(rows))
         self._order += len(rows)
         parts = _Parts(batch.time_ns[rows], message, counter, values, after_gap, order)
@@ -466,7 +484,7 @@ class CanDecoder:
         counter = self._settled + np.arange(len(parts))
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
-        return self._block(time_ns, counter, parts.values, _Firsts(parts.time_ns, parts.order, parts.after_gap))
+        return self._block(time_ns, counter, parts.values, self._singly(parts))
 
     def _joined(self, parts: _Parts) -> SampleBlock:
         """Join parts to samples; parts of an incomplete sample are kept for the next
@@ -489,14 +507,14 @@ class CanDecoder:
         counter = self._settled + np.arange(settled)
         self._settled += settled
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
-        firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)[complete]
+        firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)
+        given_up = self._given_up + np.cumsum(~complete)
+        gaps = self._gaps_before + np.cumsum(firsts.after_gap)  # also before samples that are given up
+        if settled:
+            self._given_up, self._gaps_before = int(given_up[-1]), int(gaps[-1])
+        firsts = replace(firsts, gaps=gaps, given_up=given_up)[complete]
         block = self._block(time_ns[complete], counter[complete], values[:, complete], firsts)
-        given_up = settled - int(complete.sum())
-        # A counter misses those too that are given up.
-        self._given_up += given_up
-        known = min(self._given_up, block.missing)
-        self._given_up -= known
-        return replace(block, incomplete=block.incomplete + given_up, missing=block.missing - known)
+        return replace(block, incomplete=block.incomplete + settled - int(complete.sum()))
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
         """The values (columns, rows) of parts that belong to samples ``row``."""
@@ -578,10 +596,11 @@ class CanDecoder:
 
     def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64], firsts: _Firsts) -> SampleBlock:
         """Whole samples, with the counts of those that are left out."""
-        placed = None
+        placed, missing = None, 0
         if self._timeline is not None:
             placed = self._timeline.place(self._arrivals(values, firsts))
             time_ns, values, firsts = placed.time_ns, values[:, placed.new], firsts[placed.new]
+            missing = self._missing(placed, firsts)
             counter = placed.counter if self._layout.count or not self._layout.counters else counter[placed.new]
         fresh = np.ones(len(time_ns), dtype=bool)
         for name, latest_s in self._layout.latest_s.items():
@@ -600,7 +619,7 @@ class CanDecoder:
         block = SampleBlock(time_ns, counter, readings, auxiliary, invalid=invalid, incomplete=stale)
         if placed is not None:
             repeated = len(placed.new) - int(placed.new.sum())
-            block = replace(block, missing=placed.missing, restarts=placed.restarts, duplicates=repeated)
+            block = replace(block, missing=missing, restarts=placed.restarts, duplicates=repeated)
         return block
 
     def _arrivals(self, values: NDArray[np.float64], firsts: _Firsts) -> Arrivals:
@@ -610,17 +629,35 @@ class CanDecoder:
         counts = values[at].astype(np.int64) if count else None
         stamps = values[at + (count is not None)].astype(np.int64) if stamp else None
         elapsed = np.diff(firsts.time_ns, prepend=self._placed_ns or firsts.time_ns[:1].sum())
+        after_gap = np.diff(firsts.gaps, prepend=self._gaps_at_last_sample) > 0
         if len(firsts.time_ns):
-            self._placed_ns = int(firsts.time_ns[-1])
+            self._placed_ns, self._gaps_at_last_sample = int(firsts.time_ns[-1]), int(firsts.gaps[-1])
         return Arrivals(
             counts,
             stamps,
             np.zeros(len(firsts.time_ns), np.int64),
             firsts.time_ns,
-            firsts.after_gap | (elapsed > LATEST * self._period_ns),
-            # A time stamp bridges a gap by itself; a counter may wrap within.
-            np.zeros(len(firsts.time_ns), dtype=bool) if stamp else firsts.after_gap,
+            after_gap | (elapsed > LATEST * self._period_ns),
+            # A time stamp bridges a gap by itself, unless it may wrap within.
+            after_gap & (elapsed > self._bridged_ns),
         )
+
+    def _missing(self, placed: Placed, firsts: _Firsts) -> int:
+        """Samples between those that were placed, without those that were given up."""
+        if not len(placed.counter):
+            return 0
+        before = placed.counter[0] - 1 if self._count is None else self._count
+        lost = np.diff(placed.counter, prepend=before) - 1
+        known = np.diff(firsts.given_up, prepend=self._given_up_at_last)
+        self._count, self._given_up_at_last = int(placed.counter[-1]), int(firsts.given_up[-1])
+        return int(np.maximum(lost - known, 0).sum()) if self._layout.count else 0
+
+    def _singly(self, parts: _Parts) -> _Firsts:
+        """Each part as a sample of its own."""
+        firsts = _Firsts.each(parts.time_ns, parts.order, parts.after_gap)
+        gaps = self._gaps_before + firsts.gaps
+        self._gaps_before = int(gaps[-1])
+        return replace(firsts, gaps=gaps)
 
 
 def _timeline(layout: Layout, period_ns: float) -> Timeline | None:
@@ -691,12 +728,12 @@ class CanDriver:
         if bus.bitrate is None or not bus.classic:
             return {}
         found: dict[str, LineLoad] = {}
-        counted: set[Identifier] = set()
+        counted: set[object] = set()
         for name in bundle.profile.streams:
             layout = _layout(bundle, name)
             bits = []
             for number, message in enumerate(layout.messages[: layout.sample]):
-                key = message.identifier_of(bus.node_id or 0), message.extended
+                key = message.identifier_of(bus.node_id or 0), message.extended, message.selected
                 if key not in counted:
                     bits.append(8 * layout.size(number) + (EXTENDED_BITS if message.extended else STANDARD_BITS))
                 counted.add(key)

@@ -243,6 +243,9 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     for m, signal in found.values():
         parts.need(m, signal)
     sample = parts.settle(where)
+    if begins is not None and len(parts.places(begins)) > 1:
+        names = ", ".join(f"'{sample[i].title}'" for i in parts.places(begins))
+        raise ProfileError(f"{where}: together: which of {names} begins a sample cannot be told; name another message")
     # Frames beside it, which have the newest value of some channels.
     for m, signal in chosen.values():
         if parts.place(m, signal) is None:
@@ -285,10 +288,12 @@ class _Frames:
 
     def place(self, m: int, signal: Signal | None = None) -> int | None:
         """The first kind of frame with message ``m`` that holds the signal."""
-        held = (
-            i for i, (n, selected) in enumerate(self._kinds) if n == m and (not signal or _implied(signal, selected))
-        )
-        return next(held, None)
+        return next(iter(self.places(m, signal)), None)
+
+    def places(self, m: int, signal: Signal | None = None) -> list[int]:
+        """All such kinds of frame."""
+        kinds = enumerate(self._kinds)
+        return [i for i, (n, selected) in kinds if n == m and (signal is None or _implied(signal, selected))]
 
     def place_of(self, m: int, signal: Signal | None = None) -> int:
         """The same where it has been needed."""
@@ -433,8 +438,8 @@ def _valid(
     in the sample."""
     entries = []
     for name, values in validity:
-        held = [(frames.place(m, signal), signal) for m, signal in index.holders(name, where)]
-        found = [(place, signal) for place, signal in held if place is not None and place < len(sample)]
+        held = [(place, signal) for m, signal in index.holders(name, where) for place in frames.places(m, signal)]
+        found = [(place, signal) for place, signal in held if place < len(sample)]
         if not found:
             names = ", ".join(m.title for m in sample)
             raise ProfileError(f"{where}: valid: '{name}' is in no message of the sample ({names})")
@@ -509,7 +514,8 @@ SELECTORS_MOST = 8  # one above the other; files have two at most
 TOKENS_MOST = 1_000_000  # statements and quoted texts; a vehicle's value tables have some hundred thousand
 
 _TOKEN = re.compile(
-    rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_|SG_MUL_VAL_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
+    rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
+    rb'|^[ \t]*SG_MUL_VAL_\s+(?P<selected>[^";]{0,20000};?)'
     rb"|^(?P<word>[A-Za-z]\w*)",
     re.MULTILINE,
 )
@@ -524,8 +530,8 @@ _SIGNAL = re.compile(
     rb"(\w+)\s*(?:\s(?:(M)|m(\d{1,10})(M?))\s*)?:\s*(\d{1,10})\s*\|\s*(\d{1,10})\s*@\s*([01])\s*([-+])"
     rb"\s*\(\s*" + _NUMBER + rb"\s*,\s*" + _NUMBER + rb"\s*\)"
 )
-_SELECTED = re.compile(rb"(\d{1,10})\s+(\w+)\s+(\w+)\s+((?:\d{1,10}\s*-\s*\d{1,10}\s*,?\s*){1,100})")
-_RANGE = re.compile(rb"(\d+)\s*-\s*(\d+)")
+_SELECTED = re.compile(rb"(\d{1,10})\s+(\w+)\s+(\w+)\s+(\d[^;]*);")
+_RANGE = re.compile(rb"\s*(\d{1,20})\s*-\s*(\d{1,20})\s*")
 _VALUE_TYPE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:?\s*([0-3])\b")
 _LONG_NAME = re.compile(
     rb'^[ \t]*BA_\s+"System(?:Signal|Message)LongSymbol"\s+(?:BO_|SG_)\s+(\d{1,10})(?:\s+(\w+))?\s*"(\w+)"',
@@ -632,7 +638,10 @@ class _File:
                 floats |= self._float(rest, at)
             elif kind == b"SG_MUL_VAL_":
                 number, name, by = self._selection(rest, at)
-                selected.setdefault(number, {})[name] = by
+                earlier = selected.setdefault(number, {}).get(name)
+                if earlier is not None and earlier[0] == by[0]:
+                    by = (by[0], earlier[1] + by[1])
+                selected[number][name] = by
             elif not messages:
                 self._fail(at, "a signal (SG_) of no message")
             else:
@@ -651,6 +660,8 @@ class _File:
                 self._fail(token.start(), f"more than {TOKENS_MOST} statements and texts")
             if token["word"] and token["word"] not in _KEYWORDS:
                 self._fail(token.start(), "expected a keyword of DBC (VERSION, BO_, CM_ …)")
+            if token["selected"] is not None:
+                yield b"SG_MUL_VAL_", token["selected"], token.start("selected")
             if token["kind"]:
                 yield token["kind"], token["rest"], token.start("kind")
 
@@ -678,10 +689,11 @@ class _File:
             message.numbers[title] = int(number)
 
     def _selection(self, rest: bytes, at: int) -> tuple[int, str, _By]:
-        m = _SELECTED.match(rest)
-        if m is None:
+        m = _SELECTED.fullmatch(rest)
+        found = [_RANGE.fullmatch(part) for part in m[4].split(b",")] if m else []
+        ranges = tuple((int(one[1]), int(one[2])) for one in found if one)
+        if m is None or len(ranges) < len(found):
             self._fail(at, "expected SG_MUL_VAL_ identifier name selector first-last, …;")
-        ranges = tuple((int(first), int(last)) for first, last in _RANGE.findall(m[4]))
         return int(m[1]), m[2].decode(), (m[3].decode(), ranges)
 
     def _float(self, rest: bytes, at: int) -> set[tuple[int, str]]:
@@ -752,7 +764,14 @@ def stream_layout(stream: CanStream, files: Mapping[str, bytes], *, where: str) 
                     f"{stream.file} ({where}): message '{clipped(message.name)}' has an identifier of 11 bits, and "
                     "those of J1939 have 29"
                 )
-        return replace(layout, messages=tuple(replace(m, j1939=True) for m in layout.messages))
+        groups = tuple(replace(m, j1939=True) for m in layout.messages)
+        for a, b in combinations(groups, 2):
+            if a.group == b.group and not any(x.apart_from(y) for x in a.selected for y in b.selected):
+                raise ProfileError(
+                    f"{stream.file} ({where}): messages '{clipped(a.name)}' and '{clipped(b.name)}' are of one PGN, "
+                    "which J1939 does not tell apart; take the channels from one of them"
+                )
+        return replace(layout, messages=groups)
     return layout
 
 

@@ -68,6 +68,7 @@ async def opened(opening: Callable[[], T], closing: Callable[[T], object]) -> T:
         raise
 
 
+SYNC = 0x080  # identifier of the SYNC object (CiA 301)
 BATCH_FRAMES, BATCH_S = 256, 0.2
 CAPACITY = 1 << 16
 """Frames of a unit that wait for the event loop: a whole minute of the fastest
@@ -302,6 +303,8 @@ class CanLine:
         self._queues: list[FrameQueue] = []
         self._listeners: dict[Identifier, Callable[[Frame], None]] = {}
         self._failure: BusError | None = None
+        self._syncs: dict[object, float] = {}  # periods [s] of those who want SYNC
+        self._syncing: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Open the line, unless it is open and receives frames. Raises BusError."""
@@ -357,6 +360,31 @@ class CanLine:
             for queue in self._queues:
                 if queue.identifiers is None:
                     queue.put([frame])
+
+    def sync(self, period_s: float) -> object:
+        """Have SYNC sent (CiA 301) every ``period_s``; returns what `unsync` wants. All
+        units on the line hear it, so one sequence serves them, at the shortest period
+        of any."""
+        wanted = object()
+        self._syncs[wanted] = period_s
+        if self._syncing is None:
+            self._syncing = asyncio.create_task(self._send_syncs())
+        return wanted
+
+    def unsync(self, wanted: object) -> None:
+        self._syncs.pop(wanted, None)
+        if not self._syncs and self._syncing is not None:
+            self._syncing.cancel()
+            self._syncing = None
+
+    async def _send_syncs(self) -> None:
+        loop = asyncio.get_running_loop()
+        next_s = loop.time()
+        while True:
+            with suppress(BusError):  # the streams tell
+                await asyncio.to_thread(self.send, SYNC, b"")
+            next_s = max(next_s + min(self._syncs.values(), default=1.0), loop.time())
+            await asyncio.sleep(next_s - loop.time())
 
     def hear(self, queue: FrameQueue) -> None:
         """``queue`` gets the frames that it has been opened for."""

@@ -3,6 +3,7 @@ is to be sent."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import os
@@ -17,6 +18,8 @@ import numpy as np
 import pytest
 
 from tests.canopen_node import MappedNode
+from triaxcal_drivers.can.line import join, leave
+from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import BUILT_IN, parse_bundle
 from triaxcal_drivers.errors import ProfileError
 from triaxcald.recording.reader import Recording
@@ -134,7 +137,7 @@ def test_a_step_that_the_unit_refuses_makes_it_absent(
 ) -> None:
     path = workshop.folder / "a.mcap"
     unknown = ('{ write = "kind", value = 254 }', '{ write = "spare", value = 1 }')
-    register = ("[registers]\n", '[registers]\nspare = { object = "0x2999:00", type = "uint8" }\n')
+    register = ("\n[sequences]", 'spare = { object = "0x2999:00", type = "uint8" }\n\n[sequences]')
     done = record(triaxcal, station(unknown, register), path)
     assert done.code == 4, done.err
     assert "register spare (0x2999:00)" in done.err.splitlines()[-1]
@@ -153,6 +156,26 @@ def test_a_unit_that_answers_sync_gets_it_while_its_stream_is_read(
     sent = node.sent
     time.sleep(0.1)
     assert node.sent == sent  # nothing after the command
+
+
+async def test_sync_is_sent_once_for_all_units_on_a_bus(channel: str) -> None:
+    settings = BusSettings(interface="virtual", channel=channel)
+    got: list[float] = []
+    with can.Bus(channel, interface="virtual") as bus:
+        notifier = can.Notifier(bus, [lambda msg: got.append(msg.timestamp) if msg.arbitration_id == 0x80 else None])
+        lines = [await join(settings) for _ in range(3)]
+        wanted = [line.sync(period) for line, period in zip(lines, (0.02, 0.05, 0.02), strict=True)]
+        await asyncio.sleep(0.5)
+        for line, want in zip(lines, wanted, strict=True):
+            line.unsync(want)
+        await asyncio.sleep(0.05)
+        so_far = len(got)
+        await asyncio.sleep(0.1)
+        for line in lines:
+            await leave(line)
+        notifier.stop()
+    assert len(got) == so_far <= 27
+    assert so_far > 5
 
 
 class Commanded(can.Listener):

@@ -83,6 +83,7 @@ MULTIPLEXED = (
         "",
         "SG_MUL_VAL_ 100 One Which 0-0;\nSG_MUL_VAL_ 100 Two Which 1-1;\nSG_MUL_VAL_ 100 Three Two 5-5;\n",
         "SG_MUL_VAL_ 100 One Which 0-0, 3-3;\nSG_MUL_VAL_ 100 Two Which 1-1;\nSG_MUL_VAL_ 100 Three Two 0-2, 7-9;\n",
+        "SG_MUL_VAL_ 100 One Which 0-0,\n 3-3;\nSG_MUL_VAL_ 100 Two Which 1-1;\nSG_MUL_VAL_ 100 Three Two\n 2-7;\n",
     ],
 )
 def test_multiplexed_signals_are_in_the_frames_in_which_cantools_finds_them(ranges: str) -> None:

@@ -41,6 +41,10 @@ BO_ 96 Wit: 8 S
  SG_ T m86 : 16|16@1- (0.01,0) [0|0] "" S
 """
 FILE = cantools.database.load_string(DBC, "dbc")
+OURS = DBC.replace("SG_ N :", 'SG_ Short : 15|8@0+ (1,0) [0|0] "" S\n SG_ N :').replace(
+    "SG_ Good :", 'SG_ Cycle : 0|8@1+ (1,0) [0|0] "" S\n SG_ Good :'
+)
+"""With shorter counters in the same places."""
 BEGIN: dict[str, Any] = {
     "together": {"begins": "Time"},
     "channels": {"ux": "ax", "uy": "ay", "uz": "az"},
@@ -52,7 +56,7 @@ Record = tuple[int, int, int, bytes]
 
 def layout(**keys: Any) -> Layout:
     stream = DbcStream.model_validate({"layout": "dbc", "file": "f.dbc", **keys})
-    return stream_layout(stream, {"f.dbc": DBC.encode()}, where="test")
+    return stream_layout(stream, {"f.dbc": OURS.encode()}, where="test")
 
 
 def frame(time_ns: int, message: str, **signals: float) -> Record:
@@ -145,21 +149,69 @@ def test_no_pause_of_the_host_costs_a_sample(seed: int, cuts: Sequence[int]) -> 
     assert (len(block), block.incomplete, block.missing) == (300, 0, 0)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("cuts", [(), tuple(range(1, 800))])
-def test_frames_lost_in_a_row_never_mix_two_cycles(seed: int, cuts: Sequence[int]) -> None:
+@pytest.mark.parametrize(("jitter_ms", "rate"), [(0, 1.0), (1, 0.97), (3, 1.0), (0.5, 1.03), (0, 1.09)])
+def test_frames_lost_in_a_row_never_mix_two_cycles(
+    seed: int, cuts: Sequence[int], jitter_ms: float, rate: float
+) -> None:
+    """Whatever the jitter of the host, and where the device is faster or slower than it says."""
     rng = np.random.default_rng(seed)
     frames = [record for k in range(200) for record in cycle(k)]
     lost: set[int] = set()
     for begun in rng.integers(0, len(frames), 12):
         lost |= set(range(begun, begun + rng.integers(1, 8)))
-    records = [record for i, record in enumerate(frames) if i not in lost]
+    # The three frames of a cycle follow each other at once.
+    at = np.array([10 * MS * (i // 3) / rate + 0.25 * MS * (i % 3) for i in range(len(frames))])
+    at = np.maximum.accumulate(at + rng.uniform(0, jitter_ms * MS, len(at)))
+    records = [(int(t), *frame[1:]) for i, (t, frame) in enumerate(zip(at, frames, strict=True)) if i not in lost]
     whole = [k for k in range(200) if not lost & {3 * k, 3 * k + 1, 3 * k + 2}]
     block = decoded(layout(**BEGIN, counter="N", time_stamp=STAMP), records, cuts)
     assert set(block.counter.tolist()) <= set(whole)
     assert block.readings[:, 0].tolist() == [k % 100 for k in block.counter.tolist()]
     assert block.time_ns.tolist() == [block.time_ns[0] + 10 * MS * (k - block.counter[0]) for k in block.counter]
     assert len(block) >= len(whole) - 2  # those at the end wait for begins that never come
+
+
+@pytest.mark.parametrize("cuts", CUTS)
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_a_known_gap_is_not_forgotten_where_it_leaves_a_sample_incomplete(first: int, cuts: Sequence[int]) -> None:
+    """A counter of 8 bits turns within the gap, and the host's clock tells by how much."""
+    keys = {**BEGIN, "counter": "Short"}
+    before = [record for k in range(20) for record in cycle(k)]
+    after = [record for k in range(420, 440) for record in cycle(k)][first:]
+    block = decoded(layout(**keys), [*before, *after], cuts, lost_before=len(before))
+    steps = np.diff(block.time_ns)
+    assert steps.max() == pytest.approx(4.01e9, abs=0.03e9)
+    assert np.count_nonzero(steps != 10 * MS) == 1
+
+
+def test_a_slow_channel_goes_with_a_counter_in_every_message() -> None:
+    records = [(t, s, f, bytes([k]) + d[1:]) for k in range(20) for t, s, f, d in [wit(10 * MS * k + 5, 81, AX=k)]]
+    records = [frame(0, "Temp", temp=20.0), *records]
+    keys = {"channels": {**WIT["channels"], "temp_c": {"signal": "temp", "latest_s": 5}}, "counter": "Cycle"}
+    block = decoded(layout(**keys), records)
+    assert block.channels["temp_c"].tolist() == [20.0] * len(block)
+    assert block.readings[:, 0].tolist() == list(range(20))
+    assert (block.missing, block.incomplete) == (0, 0)
+
+
+@pytest.mark.parametrize("order", [("AX", "GX"), ("GX", "AX")])
+def test_a_begin_that_comes_in_several_kinds_of_frame_is_refused(order: tuple[str, str]) -> None:
+    channels = {"ux": order[0], "uy": order[1], "uz": "ax"}
+    with pytest.raises(ProfileError, match="begins a sample cannot be told"):
+        layout(channels=channels, together={"begins": "Wit"})
+
+
+def test_valid_counts_in_every_kind_of_frame() -> None:
+    keys = {"channels": {"ux": "AX", "uy": "AY", "uz": "GX"}, "together": "time", "valid": "Good"}
+    records = []
+    for k in range(4):
+        at = 10 * MS * k
+        records += [wit(at, 81, AX=k), wit(at + 1, 82, good=int(k != 2))]
+    block = decoded(layout(**keys), records)
+    assert block.readings[:, 0].tolist() == [0, 1, 3]
+    assert block.invalid == 1
 
 
 @pytest.mark.parametrize("cuts", CUTS)
