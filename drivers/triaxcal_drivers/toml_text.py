@@ -113,8 +113,10 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
     except ValidationError as e:
         errors = e.errors()
         first = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
-        missing = first["type"] == "missing"  # then the last part is a key that the data lack
-        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"], missing=missing)]
+        loc = first["loc"]
+        # The last part may be a key, or a place, that the data lack.
+        lacked = first["type"] == "missing" or (bool(loc) and loc[-1] in _keys_at(model, loc[:-1]))
+        path = [str(p) for p in loc if not _is_tag(p, data, loc, lacked=lacked)]
         line = _line_of(text, path)
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
@@ -130,7 +132,7 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
         raise ProfileError(f"{where}{at}: {field}{message[0].lower()}{message[1:]}") from e
 
 
-def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...], *, missing: bool) -> bool:
+def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...], *, lacked: bool) -> bool:
     """Whether a part of pydantic's location is the name of a union member
     rather than a key of the data."""
     at = data
@@ -139,7 +141,7 @@ def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...], *, missing: 
             isinstance(at, (list, tuple)) and isinstance(p, int) and p < len(at)
         )
         if p is part and not inside:
-            return p is not loc[-1] or not missing
+            return p is not loc[-1] or not lacked
         if inside:
             at = at[p]
     return False
