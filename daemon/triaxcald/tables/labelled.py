@@ -26,6 +26,8 @@ from triaxcald.tables.native_csv import FIELDS_MOST
 
 HEAD = 2**20
 """Characters in which such lines are looked for."""
+LINE_MOST = 4096
+"""Characters of a line with a name for each number: some ten sensors of nine axes."""
 LINES_LEAST = 2
 """One line that looks so is no table."""
 MOSTLY = 0.5
@@ -252,7 +254,7 @@ class _Kinds:
 
 
 def _kinds(rests: Sequence[str]) -> _Kinds | None:
-    head = [line for line in rests[:LINES_LOOKED_AT] if line.strip()]
+    head = [line for line in rests[:LINES_LOOKED_AT] if len(line) <= LINE_MOST and line.strip()]
     decimal = _decimal(head)
     read = [cells for line in head if (cells := _cells(line, decimal)) is not None]
     counted = Counter(tuple(name for name, _, _ in cells) for cells in read)

@@ -515,7 +515,7 @@ TOKENS_MOST = 1_000_000  # statements and quoted texts; a vehicle's value tables
 
 _TOKEN = re.compile(
     rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
-    rb'|^[ \t]*SG_MUL_VAL_\s+(?P<selected>[^";]{0,20000};?)'
+    rb'|^[ \t]*SG_MUL_VAL_\s+(?P<selected>\d[^";]{0,20000};?)'
     rb"|^(?P<word>[A-Za-z]\w*)",
     re.MULTILINE,
 )
