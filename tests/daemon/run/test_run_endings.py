@@ -331,7 +331,7 @@ async def test_what_a_run_loses_between_bus_and_disk_is_in_its_table_and_its_doc
 def test_what_a_recording_loses_between_bus_and_disk_is_in_its_summary(workshop: Any, triaxcal: Run) -> None:
     path = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device(**QUICK)) as served:
-        done = triaxcal("record", workshop.station({"bus": served.bus}), "-o", path, "--seconds", "40")
+        done = triaxcal("record", workshop.station({"bus": served.bus}), "-o", path, "--seconds", "120")
     assert done.code == 0
     (lost,) = re.findall(r", (\d+) records? lost between bus and disk$", done.err, re.MULTILINE)
     with Recording.open(path) as recording:
