@@ -183,14 +183,15 @@ class _Parts:
     """Records that belong to the stream: host time, message number, counter,
     the values they hold (those of the channels, then for each signal that says
     whether the sample is valid, 1 where it is, then the counter and time stamp that
-    one message bears), whether records were lost since the one before, and their
-    place among all records of the stream."""
+    one message bears), how many gaps there were up to it, and their place among all
+    records of the stream. A gap before a record that is in no sample, or in one that
+    is given up, is so that of the next sample."""
 
     time_ns: Ints
     message: Ints
     counter: Ints
     values: NDArray[np.float64]  # (columns, n), nan where the message does not hold the column
-    after_gap: NDArray[np.bool_]
+    gaps: Ints
     order: Ints
 
     def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
@@ -199,7 +200,7 @@ class _Parts:
             self.message[rows],
             self.counter[rows],
             self.values[:, rows],
-            self.after_gap[rows],
+            self.gaps[rows],
             self.order[rows],
         )
 
@@ -212,7 +213,7 @@ class _Parts:
             np.concatenate([self.message, other.message]),
             np.concatenate([self.counter, other.counter]),
             np.concatenate([self.values, other.values], axis=1),
-            np.concatenate([self.after_gap, other.after_gap]),
+            np.concatenate([self.gaps, other.gaps]),
             np.concatenate([self.order, other.order]),
         )
 
@@ -220,12 +221,11 @@ class _Parts:
 @dataclass(frozen=True)
 class _Firsts:
     """Of each sample the part that came first: its host time, and its place among
-    all records; whether records were lost before one of its parts; and how many such
-    gaps there were, and how many samples were given up, up to it."""
+    all records; and how many gaps there were, and how many samples were given up, up
+    to it."""
 
     time_ns: Ints
     order: Ints
-    after_gap: NDArray[np.bool_]
     gaps: Ints
     given_up: Ints
 
@@ -233,19 +233,14 @@ class _Firsts:
     def of(cls, parts: _Parts, row: Ints, rows: int) -> _Firsts:
         """``row`` is the sample of each part, of ``rows``."""
         time_ns = np.full(rows, np.iinfo(np.int64).max)
-        order, after_gap = time_ns.copy(), np.zeros(rows, dtype=bool)
+        order, gaps = time_ns.copy(), np.zeros(rows, np.int64)
         np.minimum.at(time_ns, row, parts.time_ns)
         np.minimum.at(order, row, parts.order)
-        np.logical_or.at(after_gap, row, parts.after_gap)
-        return cls.each(time_ns, order, after_gap)
-
-    @classmethod
-    def each(cls, time_ns: Ints, order: Ints, after_gap: NDArray[np.bool_]) -> _Firsts:
-        """Where none is given up."""
-        return cls(time_ns, order, after_gap, np.cumsum(after_gap), np.zeros(len(order), np.int64))
+        np.maximum.at(gaps, row, parts.gaps)
+        return cls(time_ns, order, gaps, np.zeros(rows, np.int64))
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> _Firsts:
-        return _Firsts(self.time_ns[rows], self.order[rows], self.after_gap[rows], self.gaps[rows], self.given_up[rows])
+        return _Firsts(self.time_ns[rows], self.order[rows], self.gaps[rows], self.given_up[rows])
 
 
 class _Beside:
@@ -355,7 +350,7 @@ class CanDecoder:
         stamp = layout.stamp
         self._bridged_ns = 0.5e9 * stamp[2] * 2 ** min(stamp[1].length, _EXACT.bit_length()) if stamp else 0.0
         self._given_up = self._given_up_at_last = 0  # samples so far, and at the last one that was placed
-        self._gaps_before = self._gaps_at_last_sample = 0  # of messages of samples, likewise
+        self._gaps_at_last_sample = 0  # at the last one that was placed
         self._count: int | None = None  # of the last sample that was placed
         self._placed_ns = 0  # host time of the last sample that it placed
         self._order = 0  # records of the stream so far
@@ -436,23 +431,12 @@ class CanDecoder:
                     values[column, mine] = signal.raw(data).astype(np.int64) & _EXACT
             if self._layout.counters and number < self._layout.sample:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
-        # A gap is that of the next message of a sample, not of one beside it.
-        of_sample = message < self._layout.sample
-        after_gap = np.zeros(len(rows), dtype=bool)
-        after_gap[of_sample] = self._after_gap(batch, rows[of_sample])
+        gaps = self._gaps + np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
+        self._gaps = int(gaps[-1]) if len(gaps) else self._gaps
         order = self._order + np.arange(len(rows))
         self._order += len(rows)
-        parts = _Parts(batch.time_ns[rows], message, counter, values, after_gap, order)
+        parts = _Parts(batch.time_ns[rows], message, counter, values, gaps[rows], order)
         return parts, int(bad.sum()), int(short.sum())
-
-    def _after_gap(self, batch: RawBatch, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Whether a gap precedes each of the records ``rows``, also if a record of
-        another stream carries the flag."""
-        gaps = self._gaps + np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
-        after = np.diff(gaps[rows], prepend=self._gaps_at_last) > 0
-        self._gaps = int(gaps[-1]) if len(gaps) else self._gaps
-        self._gaps_at_last = int(gaps[rows[-1]]) if len(rows) else self._gaps_at_last
-        return np.asarray(after)
 
     def _messages(self, batch: RawBatch, usable: NDArray[np.bool_]) -> Ints:
         """Which message of the stream each record is; -1 for none."""
@@ -484,7 +468,12 @@ class CanDecoder:
         counter = self._settled + np.arange(len(parts))
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
-        return self._block(time_ns, counter, parts.values, self._singly(parts))
+        return self._block(
+            time_ns,
+            counter,
+            parts.values,
+            _Firsts(parts.time_ns, parts.order, parts.gaps, np.zeros(len(parts), np.int64)),
+        )
 
     def _joined(self, parts: _Parts) -> SampleBlock:
         """Join parts to samples; parts of an incomplete sample are kept for the next
@@ -509,10 +498,8 @@ class CanDecoder:
         self._last_ns = int(time_ns[-1]) if settled else self._last_ns
         firsts = _Firsts.of(parts[sample < settled], sample[sample < settled], settled)
         given_up = self._given_up + np.cumsum(~complete)
-        gaps = self._gaps_before + np.cumsum(firsts.after_gap)  # also before samples that are given up
-        if settled:
-            self._given_up, self._gaps_before = int(given_up[-1]), int(gaps[-1])
-        firsts = replace(firsts, gaps=gaps, given_up=given_up)[complete]
+        self._given_up = int(given_up[-1]) if settled else self._given_up
+        firsts = replace(firsts, given_up=given_up)[complete]
         block = self._block(time_ns[complete], counter[complete], values[:, complete], firsts)
         return replace(block, incomplete=block.incomplete + settled - int(complete.sum()))
 
@@ -533,11 +520,13 @@ class CanDecoder:
         restarted = step < -self._return
         restarted |= (step > self._range // 64) & (parts.counter < self._range // 256)
         pause = np.diff(parts.time_ns, prepend=self._last_ns) / self._period_ns
-        for i in np.flatnonzero(parts.after_gap):
+        after_gap = np.diff(parts.gaps, prepend=self._gaps_at_last) > 0
+        self._gaps_at_last = int(parts.gaps[-1])
+        for i in np.flatnonzero(after_gap):
             step[i], restarted[i] = self._across(int(parts.counter[i] - before[i]), pause[i])
         # A burst of lost messages looks the same where a counter has few
         # bits: the host's time tells.
-        jumps = np.flatnonzero(restarted & ~parts.after_gap)
+        jumps = np.flatnonzero(restarted & ~after_gap)
         self._restarts = sum(self._across(int(parts.counter[i] - before[i]), pause[i])[1] for i in jumps)
         step[restarted] = np.maximum(1, np.rint(pause[restarted]))
         unwrapped = self._last + np.cumsum(step)
@@ -651,13 +640,6 @@ class CanDecoder:
         known = np.diff(firsts.given_up, prepend=self._given_up_at_last)
         self._count, self._given_up_at_last = int(placed.counter[-1]), int(firsts.given_up[-1])
         return int(np.maximum(lost - known, 0).sum()) if self._layout.count else 0
-
-    def _singly(self, parts: _Parts) -> _Firsts:
-        """Each part as a sample of its own."""
-        firsts = _Firsts.each(parts.time_ns, parts.order, parts.after_gap)
-        gaps = self._gaps_before + firsts.gaps
-        self._gaps_before = int(gaps[-1])
-        return replace(firsts, gaps=gaps)
 
 
 def _timeline(layout: Layout, period_ns: float) -> Timeline | None:
