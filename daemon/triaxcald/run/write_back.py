@@ -16,7 +16,7 @@ from triaxcald import text
 from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, DiskError, Implausible, StationError, TwoAnswer
 from triaxcald.inputs import VERIFICATION
-from triaxcald.provision.access import RegisterAccess, RegisterLink
+from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.correction import require_unchanged
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
@@ -36,6 +36,7 @@ from triaxcald.software import new_run_id
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station
 from triaxcald.station.power import power_cycle_asked
+from triaxcald.station.starting import recorder
 from triaxcald.verification import (
     OUTSIDE,
     UNJUDGED,
@@ -87,7 +88,7 @@ class WriteBack:
     ) -> Provisioning:
         """Identifies the unit and reads its registers; nothing is written.
         Raises Implausible, Refused, ProvisionError, StationError, DiskError."""
-        link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer), name=self.place.device_name)
+        link = RegisterLink(device, self.place.bundle.profile, recorder(self.writer), name=self.place.device_name)
         asked = power_cycle_asked(self.ask, link, self.place, self.station)
         p = Provisioning(
             link,
@@ -231,7 +232,3 @@ def _paired(pairs: Sequence[tuple[tc.Pose, tc.Pose]]) -> tuple[tc.Floats, tc.Flo
         np.array([c.mean for _, c in pairs]).reshape(-1, 3),
         {name: np.array([r.channels[name] for r, _ in pairs]) for name in names},
     )
-
-
-def _recorder(writer: RecordingWriter) -> Callable[[RegisterAccess], None]:
-    return lambda a: writer.register(a.register, a.kind, a.raw, a.error or "", unanswered=a.unanswered)

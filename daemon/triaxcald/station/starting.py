@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
 from typing import Any, cast
 
@@ -11,6 +11,11 @@ from triaxcald.errors import StationError
 from triaxcald.provision.access import RegisterAccess, RegisterLink, run_sequence
 from triaxcald.recording.schema import SENT
 from triaxcald.recording.writer import RecordingWriter
+
+
+def recorder(writer: RecordingWriter) -> Callable[[RegisterAccess], None]:
+    """Writes the register requests that it is told of."""
+    return lambda a: writer.register(a.register, a.kind, a.raw, a.error or "", unanswered=a.unanswered)
 
 
 class StartingDevice:
@@ -63,9 +68,9 @@ class StartingDevice:
             raise td.DeviceAbsent(f"{self._name} does not start: {e}") from e
         self._started = True
 
-    def _record(self, a: RegisterAccess) -> None:
+    def _record(self, access: RegisterAccess) -> None:
         if self.writer is not None:
-            self.writer.register(a.register, a.kind, a.raw, a.error or "", unanswered=a.unanswered)
+            recorder(self.writer)(access)
 
     def _record_sent(self, step: td.SendStep) -> None:
         if self.writer is not None:
