@@ -8,8 +8,9 @@ from triaxcal_drivers.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal_drivers.can.eds import object_dictionary
-    from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
+    from triaxcal_drivers.can.layout import NODES, Layout, stream_layout
     from triaxcal_drivers.can.line import BusListener, opened
+    from triaxcal_drivers.can.message import Message
     from triaxcal_drivers.can.model import BusSettings, CanBus, CanProfile, object_address
     from triaxcal_drivers.can.python_can import open_python_can
 
@@ -17,7 +18,6 @@ _NAMES = {
     "eds": ("object_dictionary",),
     "layout": (
         "Layout",
-        "Message",
         "NODES",
         "stream_layout",
     ),
@@ -25,6 +25,7 @@ _NAMES = {
         "BusListener",
         "opened",
     ),
+    "message": ("Message",),
     "model": (
         "BusSettings",
         "CanBus",

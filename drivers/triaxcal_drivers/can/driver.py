@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.layout import NODES, Layout, Message, stream_layout
+from triaxcal_drivers.can.layout import NODES, Layout, stream_layout
+from triaxcal_drivers.can.message import Message
 from triaxcal_drivers.can.model import CanBus, CanProfile
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.hints import nearest

@@ -1,4 +1,4 @@
-"""Objects of a CANopen device out of its EDS or DCF (CiA 306). No I/O.
+"""Objects and PDOs of a CANopen device, from its EDS or DCF (CiA 306). No I/O.
 
 People write these files by hand and by many tools. This file reads what the
 standard leaves open or tools leave out (letter case, order, sections and keys
@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from triaxcal_drivers.can.message import Message, Signal
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.files import size
 from triaxcal_drivers.hints import clipped
@@ -27,6 +28,8 @@ logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it logs c
 EDS_MOST, LINES_MOST = 2**20, 30_000
 """Bytes and lines; a drive of three thousand objects comes near. canopen takes
 a second for so many."""
+STANDARD_MOST = 0x7FF  # the highest identifier of 11 bits
+_DISABLED, _EXTENDED = 1 << 31, 1 << 29  # bits of a PDO's COB-ID (CiA 301)
 MAPPED_MOST = 64  # objects in a PDO (CiA 301)
 COMPACT_MOST = 5000  # members that compact storage stands for; 512 PDOs of eight bytes map 4096
 _COMMENT = re.compile(r"(?:^|\s)[;#].*")
@@ -232,3 +235,63 @@ def _data_type(index: int, described: _Object) -> Iterator[str]:
     if found:
         yield f"[{index:X}sub1]"
         yield f"DefaultValue=0x{found[0]:X}"
+
+
+# PDOs.
+
+
+def pdo_messages(objects: ObjectDictionary) -> list[Message]:
+    """The TPDOs, by their mapping (0x1A00…) and COB-ID (0x1800…); signals are
+    named ``0x2300:01``. One that cannot be used says why in its ``fault``."""
+    found = (_tpdo(objects, number) for number in range(512) if 0x1800 + number in objects)
+    return [message for message in found if message is not None]
+
+
+def _tpdo(objects: ObjectDictionary, number: int) -> Message | None:
+    """None where it maps nothing and has a fault: nobody misses it then."""
+    name, cob_id, per_node, fault = f"TPDO{number + 1}", 0, False, ""
+    try:
+        cob_id, per_node = value(objects, 0x1800 + number, 1)
+    except ProfileError as e:
+        fault = f"{name}: {e}"
+    if cob_id & _DISABLED:
+        fault = f"{name} is disabled (bit 31 of its COB-ID, 0x{0x1800 + number:04X}:01 = 0x{cob_id:X})"
+    try:
+        signals = _mapped(objects, number)
+    except ProfileError as e:
+        return None if cob_id & _DISABLED else Message(name, 0, {}, fault=str(e))
+    if fault and not signals:
+        return None
+    extended = bool(cob_id & _EXTENDED)
+    identifier = cob_id & (0x1FFFFFFF if extended else STANDARD_MOST)
+    return Message(name, identifier, signals, extended, per_node, fault=fault)
+
+
+def _mapped(objects: ObjectDictionary, number: int) -> dict[str, Signal]:
+    """Raises ProfileError without the file's name."""
+    signals: dict[str, Signal] = {}
+    start = 0
+    for entry in range(1, value(objects, 0x1A00 + number, 0)[0] + 1):
+        word, _ = value(objects, 0x1A00 + number, entry)
+        index, subindex, length = word >> 16, word >> 8 & 0xFF, word & 0xFF
+        if index >= 0x20:  # below are the data types, mapped as a filler
+            signal = _mapped_signal(objects, index, subindex, start, length, f"TPDO{number + 1}")
+            signals[signal.name] = signal
+        start += length
+    if start > 64:
+        raise ProfileError(f"TPDO{number + 1} maps {start} bits, which is more than 64")
+    return signals
+
+
+def _mapped_signal(objects: ObjectDictionary, index: int, subindex: int, start: int, length: int, where: str) -> Signal:
+    from canopen.objectdictionary import datatypes
+
+    name = f"0x{index:04X}:{subindex:02X}"
+    variable = objects.get_variable(index, subindex)
+    if variable is None:
+        raise ProfileError(f"{where} maps {name}, which is not an object of the file")
+    if len(variable) != length or variable.data_type not in datatypes.NUMBER_TYPES:
+        raise ProfileError(f"{where} maps {length} bits of {name}, which is not a number of that size")
+    signed = variable.data_type in datatypes.SIGNED_TYPES
+    is_float = variable.data_type in datatypes.FLOAT_TYPES
+    return Signal(name, start, length, False, signed, is_float, float(variable.factor))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcal_drivers.can.layout import Layout, Message, Signal
+from triaxcal_drivers.can.layout import Layout
+from triaxcal_drivers.can.message import Message, Signal
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.can_frames import LoggedFrame
 from triaxcald.errors import InputError

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from triaxcal_drivers.can.layout import Message, dbc_messages
+from triaxcal_drivers.can.dbc import dbc_messages
+from triaxcal_drivers.can.message import Message
 from triaxcal_drivers.errors import ProfileError
 
 HEAD = 'VERSION "1.0"\n\nNS_ :\n\tNS_DESC_\n\tCM_\n\nBS_:\n\nBU_: A B\n\n'

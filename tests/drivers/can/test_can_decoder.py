@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from triaxcal_drivers.can.driver import LATEST, CanDecoder, CanDriver
-from triaxcal_drivers.can.layout import Layout, Message, Signal
+from triaxcal_drivers.can.layout import Layout
+from triaxcal_drivers.can.message import Message, Signal
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.profile import Bundle
 

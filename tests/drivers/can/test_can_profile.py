@@ -9,8 +9,8 @@ import pytest
 from canopen.objectdictionary import datatypes
 
 from triaxcal_drivers.can.driver import CanDriver
-from triaxcal_drivers.can.eds import object_dictionary
-from triaxcal_drivers.can.layout import pdo_messages, stream_layout
+from triaxcal_drivers.can.eds import object_dictionary, pdo_messages
+from triaxcal_drivers.can.layout import stream_layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, PdoStream, object_address
 from triaxcal_drivers.catalogue import parse_bundle
 from triaxcal_drivers.errors import ProfileError

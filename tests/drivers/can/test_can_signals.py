@@ -7,7 +7,8 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from triaxcal_drivers.can.layout import Signal, dbc_messages
+from triaxcal_drivers.can.dbc import dbc_messages
+from triaxcal_drivers.can.message import Signal
 
 
 @st.composite

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from triaxcal_drivers.can.driver import CanDecoder, CanDriver
-from triaxcal_drivers.can.layout import Layout, Message, Signal
+from triaxcal_drivers.can.layout import Layout
+from triaxcal_drivers.can.message import Message, Signal
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle
 
