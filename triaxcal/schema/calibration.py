@@ -247,7 +247,7 @@ class Calibration(Model):
     misalignment: Annotated[
         Vector, Field(description="`ax`, `ay`, `az` of [the model](../explanation/the-fit.md#the-sensor) [rad]")
     ]
-    bias: Annotated[Vector, Field(description="biases of x, y, z [g]")]
+    bias: Annotated[Vector, Field(description="biases of x, y, z at the input [g]: u = K (R a + b)")]
     use: Annotated[Text, Field(description="how readings become specific force, in words")]
     matrix: Annotated[Matrix, Field(description="A (3,3), upper triangular: a = A (u − c) without effects [g/output]")]
     centre: Annotated[Vector, Field(description="c of the same [output]")]

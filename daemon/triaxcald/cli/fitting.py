@@ -84,7 +84,8 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
         yield
     except tc.Refused as e:
         if e.wanted and not signs_given(a, measured):
-            raise tc.Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
+            assumed = "these directions assume signs of +,+,+, since no --sign was given"
+            raise tc.Refused(f"{e}; {assumed}", wanted=e.wanted) from e
         raise
 
 

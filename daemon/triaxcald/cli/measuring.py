@@ -104,16 +104,25 @@ def verify_command(a: argparse.Namespace) -> int:
 def _of_its_recording(model: tc.estimate.Calibration, name: str) -> list[str]:
     """A line each for effects of time, and of the recording, which say little
     of another recording."""
-    of_time = [e.name for e, _ in model.sensor.effects if {tc.effects.TIME, tc.effects.SINCE_START} & set(e.needs)]
-    of_run = [e.name for e, _ in model.sensor.effects if tc.effects.RUN in e.needs and e.name not in of_time]
-    out = []
-    if of_time:
-        held = model.holds_at
-        moment = f"as {held.t_s:.0f} s after its start" if held else "as long after its start"
-        out.append(f"{', '.join(of_time)} in {name} goes with the time of its own recording, and counts {moment}")
+    out = _of_its_times(model, name)
+    of_run = [e.name for e, _ in model.sensor.effects if tc.effects.RUN in e.needs and not _is_of_time(e)]
     if of_run:
         out.append(f"{', '.join(of_run)} in {name} belongs to its own recordings, and counts as in their mean")
     return out
+
+
+def _of_its_times(model: tc.estimate.Calibration, name: str) -> list[str]:
+    """A line for effects of time: the moment at which the calibration holds."""
+    of_time = [e.name for e, _ in model.sensor.effects if _is_of_time(e)]
+    if not of_time:
+        return []
+    held = model.holds_at
+    moment = f"as {held.t_s:.0f} s after its start" if held else "as long after its start"
+    return [f"{', '.join(of_time)} in {name} goes with the time of its own recording, and counts {moment}"]
+
+
+def _is_of_time(effect: tc.effects.Effect) -> bool:
+    return bool({tc.effects.TIME, tc.effects.SINCE_START} & set(effect.needs))
 
 
 def _require_trusted(measured: Measured) -> None:
@@ -171,6 +180,9 @@ def apply_command(a: argparse.Namespace) -> int:
         say(f"{a.recording}: {remark}")
     with new_beside(a.output) as path:
         samples = _written(found, path, a.output.name)
+    if not a.own_recording:
+        own = f"if {a.recording} is that recording, --own-recording takes the time of each reading"
+        found.cautions += [f"{line}; {own}" for line in _of_its_times(calibration.fitted, a.calibration)]
     warn(found.cautions)
     how = f"{', '.join(calibration.terms)}, in {calibration.reference_unit}, {FRAME}"
     say(f"{a.output}: {tc.number_format.number_of(samples, 'sample')}, {how}")

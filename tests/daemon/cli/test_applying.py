@@ -216,6 +216,7 @@ def test_effects_of_time_hold_at_each_time_of_their_own_recording(triaxcal, tmp_
     for name, more in (("at.csv", ()), ("own.csv", ("--own-recording",))):
         done = triaxcal("apply", cal, folder / "rec.csv", "-o", tmp_path / name, *more)
         assert done.code == 0, done.err
+        assert ("--own-recording" in done.err) == (not more)
     at, own = (pd.read_csv(tmp_path / n)["ax"].to_numpy() for n in ("at.csv", "own.csv"))
     since_first = pd.read_csv(tmp_path / "own.csv")["t_s"].to_numpy() - BEGIN_S
     assert at - own == pytest.approx(1e-5 * since_first, abs=1e-6)
