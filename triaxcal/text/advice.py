@@ -77,6 +77,8 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     for finding in loop.findings:
         if finding.verdict is Verdict.ADOPTED:
             yield f"{finding.effect}: this calibration corrects it. In general: {finding.remedy}"
+        else:
+            yield f"if {finding.effect} acts: {finding.remedy}"
 
 
 def _meanwhile(loop: Loop, small: ErrorUnit) -> Iterator[str]:

@@ -126,8 +126,10 @@ def _causes(
 def _named(finding: Finding) -> str:
     if not finding.alternatives:
         return likely(finding.effect, finding.probability)
-    each = {finding.effect: finding.probability, **finding.alternatives}
-    return "one of " + ", ".join(likely(name, p) for name, p in each.items())
+    first = (
+        f"{finding.effect} (likeliest)" if finding.probability is None else likely(finding.effect, finding.probability)
+    )
+    return "one of " + ", ".join([first, *(likely(name, p) for name, p in finding.alternatives.items())])
 
 
 def likely(name: str, p: float | None) -> str:

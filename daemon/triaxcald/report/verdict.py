@@ -452,7 +452,7 @@ def _who(by: Sequence[str], terms: Sequence[str], registers: Sequence[str], pass
         left = [name for name in terms if name not in registers] if REGISTERS in by else terms
         parts.append(f"{'host' if parts else 'Host or registers'}: " + _named_terms(left))
     if PROCESS in by:
-        parts.append("process: free of " + _named_terms(passing))
+        parts.append("process: avoid " + _named_terms(passing))
     return "; ".join(parts)
 
 

@@ -420,8 +420,8 @@ def test_choices_that_a_document_states_are_told_as_they_are(words: dict[str, An
     ]
     _, text = page(words, registers)
     assert "Registers: linear model alone | 900 µg | —" in text
-    assert "Registers: linear model, temperature bias; process: free of warm up | 70.0 µg | 80.0 µg" in text
-    assert "temperature bias; host: third-order nonlinearity; process: free of warm up | — | —" in text
+    assert "Registers: linear model, temperature bias; process: avoid warm up | 70.0 µg | 80.0 µg" in text
+    assert "temperature bias; host: third-order nonlinearity; process: avoid warm up | — | —" in text
 
 
 def test_without_a_device_the_choice_is_to_correct_the_effects_or_not(words: dict[str, Any]) -> None:
@@ -429,7 +429,7 @@ def test_without_a_device_the_choice_is_to_correct_the_effects_or_not(words: dic
     add(words, "warm_up", {"x": (1e-4, 1e-5, "g")})
     _, text = page(words)
     assert "Host or registers: linear model alone | 900 µg | 1100 µg" in text
-    assert "linear model, third-order nonlinearity; process: free of warm up |" in text
+    assert "linear model, third-order nonlinearity; process: avoid warm up |" in text
     assert "Who corrects it The host, or the device where it has registers for it" in text
     assert "Who corrects it Nobody: it depends on how these poses were taken" in text
 

@@ -49,7 +49,7 @@ def test_the_cause_is_told_with_its_probability() -> None:
         "hysteresis (0.1); or something that no known effect describes ("
     )
     assert cause(NOTHING, (KNOWN,)) == "hysteresis (more than 0.999) acts"
-    assert cause(NOTHING, (GROUP,)) == "one of warm_up, bias_drift (0.28) acts"
+    assert cause(NOTHING, (GROUP,)) == "one of warm_up (likeliest), bias_drift (0.28) acts"
     likely = Candidate("third_order_nonlinearity", None, {})
     assert "; third_order_nonlinearity probably acts" in cause(NOTHING, (KNOWN,), (likely,))
     hangs = Candidate("hysteresis", None, {}, hangs_on_one_pose=True)
