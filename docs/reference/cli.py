@@ -98,7 +98,7 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "token new": """Programs send `Authorization: Bearer TOKEN`. Only the SHA-256 of the token is stored. Of one name there is one token that is not revoked (exit 2).""",  # noqa: E501
     "token list": """In the order of time, revoked ones too.""",
     "token revoke": """The name is free for another token.""",
-    "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. A signal ends it with the number of recordings audited so far. Document `triaxcal.audit/1`.""",  # noqa: E501
+    "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. [Years later](../how-to/replay-and-audit.md#years-later) `--within` bounds what other versions compute. A signal ends it with the number of recordings audited so far. Document `triaxcal.audit/1`.""",  # noqa: E501
     "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501
     "log export": """A phase or stream without samples is an error (exit 2). The output must not exist.""",

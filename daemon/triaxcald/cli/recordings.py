@@ -35,7 +35,7 @@ def audit_command(a: argparse.Namespace) -> int:
     asked = to_audit(a.recordings)
     audited: list[Audited] = []
     with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
-        for one in audit_each(asked, lambda path: at(f"auditing {path}")):
+        for one in audit_each(asked, lambda path: at(f"auditing {path}"), within=a.within):
             audited.append(one)
             if one.audit is None:
                 say(f"triaxcal: {one.error}")
