@@ -831,3 +831,8 @@ def _add_other_versions(p: argparse.ArgumentParser) -> None:
         "--within", metavar="X", type=positive,
         help="figures of another triaxcal, numpy or scipy may be off by so much of their uncertainty, as 0.01",
     )  # fmt: skip
+    p.add_argument(
+        "--as-made", action="store_true",
+        help="audit under the versions that made the recording, in an environment built of --wheels",
+    )  # fmt: skip
+    p.add_argument("--wheels", metavar="FOLDER", type=Path, help="with wheels of these versions; nothing is downloaded")
