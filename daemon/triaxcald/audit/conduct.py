@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from triaxcald.audit import contents, previews
 from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.audit.drawings import same_report
-from triaxcald.audit.figures import Agreement, furthest
+from triaxcald.audit.figures import SHARE, Agreement, furthest
 from triaxcald.audit.results import (
     CANNOT,
     DRAWN_WITH,
@@ -33,6 +33,7 @@ from triaxcald.audit.results import (
     sealed_later,
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
+from triaxcald.audit.within import COMPUTES, Within, moved, same_within
 from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
@@ -55,6 +56,7 @@ Compute = Callable[[Recording, Digests], Again]
 class Result(StrEnum):
     SAME_BYTES = "same_bytes"
     SAME_FIGURES = "same_figures"
+    WITHIN = "within"
     DIFFERS = "differs"
 
 
@@ -97,17 +99,22 @@ class Audit:
     furthest: tuple[float, str] | None = None
     """Of another version's calibration: the largest difference of a coefficient
     in its standard error, and which."""
+    within: Within | None = None
+    """Of other software's figures, where it was asked for how far they may be off."""
 
     @property
     def result(self) -> Result:
         if self.differences:
             return Result.DIFFERS
+        if self.within and self.agreement.of_uncertainty > SHARE:
+            return Result.WITHIN
         return Result.SAME_FIGURES if self.agreement.figures else Result.SAME_BYTES
 
 
-def audit(path: Path, *, compute: Compute = compute) -> Audit:
+def audit(path: Path, *, compute: Compute = compute, within: float | None = None) -> Audit:
     """Raises RecordingError where the file cannot be read, or holds no result.
-    ``compute`` makes the results again."""
+    ``compute`` makes the results again. ``within``: so much of its uncertainty a figure
+    may be off that another version of triaxcal, numpy or scipy computed."""
     if is_manifest(path):
         raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
     with Recording.open(path) as recording:
@@ -118,7 +125,7 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
             )
         if recording.ends_with != FORMAT:
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
-        return _Audit(path, recording, compute).run()
+        return _Audit(path, recording, compute, within).run()
 
 
 COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
@@ -126,7 +133,7 @@ COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
 
 
 class _Audit:
-    def __init__(self, path: Path, recording: Recording, compute: Compute) -> None:
+    def __init__(self, path: Path, recording: Recording, compute: Compute, within: float | None = None) -> None:
         self._path, self._recording, self._compute = path, recording, compute
         self._held = {name: recording.attachments[name] for name in recording.attachments if "/" not in name}
         self._checked: list[str] = []
@@ -137,6 +144,8 @@ class _Audit:
         self._listed_report = False
         self._agreement = Agreement()
         self._furthest: tuple[float, str] | None = None
+        by = {name: then for name, (then, _) in self._versions().items() if name in COMPUTES}
+        self._within = Within(within, by) if within is not None and by else None
 
     def run(self) -> Audit:
         found = survey(self._recording, ATTACHMENT)
@@ -159,14 +168,20 @@ class _Audit:
         return Audit(
             str(self._path),
             tuple(dict.fromkeys(self._checked)),
-            tuple(d for i, d in enumerate(self._differences) if d not in self._differences[:i]),
+            tuple(self._of_figure(d) for i, d in enumerate(self._differences) if d not in self._differences[:i]),
             self._notes(tuple(not_beside)),
             verdict if isinstance(verdict, str) else None,
             self._agreement,
             self._computed_on(),
             self._made_by,
             self._furthest,
+            self._within,
         )
+
+    def _of_figure(self, of: Difference) -> Difference:
+        """With its share of the uncertainty, where that was asked for."""
+        share = self._within.share_at(of.part, of.place) if self._within and of.kind is Kind.VALUE else None
+        return replace(of, of_uncertainty=share)
 
     @property
     def _made_by(self) -> str | None:
@@ -184,14 +199,16 @@ class _Audit:
     def _again(self) -> Again | None:
         try:
             again = self._compute(self._recording, self._raw)
-            again, self._agreement = as_stored(again, {name: _object(self._held.get(name, b"")) for name in COMPUTED})
-            stored = _object(self._held.get(CERTIFICATE, b"")) if self._made_by else None
-            if stored is None:
-                return again
-            if again.certified is not None:
+            documents = {name: _object(self._held.get(name, b"")) for name in COMPUTED}
+            computed, (again, self._agreement) = again, as_stored(again, documents)
+            stored = documents[CERTIFICATE] if self._made_by else None
+            if stored is not None and again.certified is not None:
                 both = (document["result"]["calibration"] for document in (stored, again.certified.document))
                 self._furthest = furthest(*both)
-            return by_its_own_words(again, stored)
+            if self._within is not None:
+                self._within = replace(self._within, moved=tuple(moved(computed, documents)))
+                return same_within(again, documents, self._within.limit, self._agreement)
+            return again if stored is None else by_its_own_words(again, stored)
         except CANNOT as e:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
             return None
@@ -260,7 +277,8 @@ class _Audit:
         ending = None if self._aborted else again.ending()
         if ending is not None and again.certified is not None:
             if ending.verdict is not Verdict.FAIL:
-                same = self._made_by is None or CERTIFICATE not in self._held
+                by_another = self._made_by is not None or self._within is not None
+                same = not by_another or CERTIFICATE not in self._held
                 document = to_text(again.certified.document).encode() if same else self._held[CERTIFICATE]
                 found[CERTIFICATE] = digest_of(document)
             if REPORT in self._held:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any
 
@@ -87,13 +87,15 @@ class Kind(Enum):
 @dataclass(frozen=True)
 class Difference:
     """``part`` is an attachment, a topic, a metadata record, or a file;
-    ``place`` where in it."""
+    ``place`` where in it. ``of_uncertainty``: by how much of its uncertainty a figure
+    of other software is off, where it has one and that was asked for."""
 
     part: str
     kind: Kind
     place: str = ""
     stored: Any = NOTHING
     again: Any = NOTHING
+    of_uncertainty: float | None = field(default=None, kw_only=True)
 
 
 def compare(part: str, stored: bytes, again: bytes, *, by_another: bool = False) -> list[Difference]:

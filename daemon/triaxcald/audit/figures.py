@@ -30,6 +30,9 @@ CORRELATION = 1e-2
 and ν = 50."""
 WORDED = 5e-5
 """Of itself: so far a figure may be from the edge between two wordings."""
+LAST_PLACES = 100
+"""Of a figure that is written with two digits of its uncertainty: so many make one
+uncertainty, at most."""
 _OF_ONE_POSE = ("residual_g", "before_residual_g", "error_g")
 _NUMERAL = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
@@ -58,9 +61,11 @@ class Agreement:
 @dataclass(frozen=True)
 class Figures:
     """Those of a document that was computed again: their uncertainties by
-    place, and the digits of all of them."""
+    place, and the digits of all of them. ``share`` of its uncertainty is how far
+    a figure may be off and be the same."""
 
     document: Mapping[str, Any]
+    share: float = SHARE
     uncertainties: Mapping[str, float] = field(init=False)
     digits: Sequence[float] = field(init=False)
 
@@ -85,8 +90,8 @@ class Figures:
             pairs = enumerate(zip(stored, again, strict=True))
             return [self._taken(s, a, f"{at}[{i}]", key, part, agreement) for i, (s, a) in pairs]
         if isinstance(again, tc.rounding.Printed) and type(stored) is float and stored != again:
-            uncertainty = self.uncertainties.get(at) or again.known_to
-            if same_figure(stored, again, uncertainty):
+            uncertainty = self.uncertainty_of(at, again)
+            if same_figure(stored, again, uncertainty, self.share):
                 agreement.take(f"{part}: {at}", abs(stored - again), again, uncertainty)
                 return stored
         worded = key in SENTENCES and isinstance(again, str) and isinstance(stored, str) and stored != again
@@ -94,6 +99,10 @@ class Figures:
             agreement.figures += 1
             return stored
         return again
+
+    def uncertainty_of(self, place: str, figure: float) -> float | None:
+        """Of the ``figure`` at the ``place``; None where the document states none."""
+        return self.uncertainties.get(place) or getattr(figure, "known_to", None)
 
     def same_words(self, stored: str, again: str) -> bool:
         """Whether two sentences have the same words, and numerals that are the
@@ -110,6 +119,8 @@ class Figures:
             apart = 1.001 * max(_last_place(stored), _last_place(again))
         except (OverflowError, ValueError):  # a power that no figure has
             return False
+        if self.share > SHARE and not (stored.isdecimal() and again.isdecimal()):
+            return abs(one - other) <= apart * (1 + self.share * LAST_PLACES)
         return abs(one - other) <= apart and self._is_edge((one + other) / 2)
 
     def _is_edge(self, between: float) -> bool:
@@ -138,10 +149,10 @@ def furthest(stored: Any, again: Any) -> tuple[float, str] | None:
     return max(shares, default=None)
 
 
-def same_figure(stored: float, again: tc.rounding.Printed, uncertainty: float | None) -> bool:
+def same_figure(stored: float, again: tc.rounding.Printed, uncertainty: float | None, share: float = SHARE) -> bool:
     """Whether the ``stored`` figure could be the one that was computed
-    ``again``."""
-    if abs(stored - again) <= max(SHARE * (uncertainty or 0.0), RELATIVE * abs(again)):
+    ``again``, up to this ``share`` of its uncertainty."""
+    if abs(stored - again) <= max(share * (uncertainty or 0.0), RELATIVE * abs(again)):
         return True
     # A number on the edge between two printed ones may stand as either.
     steps = stored / again.step if again.step else 0.0
@@ -241,6 +252,11 @@ def _placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:
 
 def _printed(document: Any) -> Iterator[tc.rounding.Printed]:
     return (leaf for _, leaf in _placed(document) if isinstance(leaf, tc.rounding.Printed))
+
+
+def figures_of(document: Any) -> Iterator[tuple[str, float]]:
+    """Those of a document, by place."""
+    return ((at, leaf) for at, leaf in _placed(document) if isinstance(leaf, float))
 
 
 def inside(at: str, key: str) -> str:

@@ -38,14 +38,17 @@ def to_audit(asked: Sequence[Path]) -> list[Path | Audited]:
     return list(found.values())
 
 
-def audit_each(of: Iterable[Path | Audited], begins: Callable[[Path], None] = lambda path: None) -> Iterator[Audited]:
-    """Audit what `to_audit` found; ``begins`` is called before each recording."""
+def audit_each(
+    of: Iterable[Path | Audited], begins: Callable[[Path], None] = lambda path: None, *, within: float | None = None
+) -> Iterator[Audited]:
+    """Audit what `to_audit` found; ``begins`` is called before each recording.
+    ``within`` as in `audit`."""
     for one in of:
         if isinstance(one, Audited):
             yield one
         else:
             begins(one)
-            yield _audited(one)
+            yield _audited(one, within)
 
 
 def worst(of: Iterable[Audited]) -> int:
@@ -53,9 +56,9 @@ def worst(of: Iterable[Audited]) -> int:
     return next((code for code in SEVEREST if code in codes), DONE)
 
 
-def _audited(path: Path) -> Audited:
+def _audited(path: Path, within: float | None) -> Audited:
     try:
-        found = audit(path)
+        found = audit(path, within=within)
     except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         return Audited(str(path), None, str(e), exit_code_of(e))
     except Exception as e:

@@ -231,7 +231,7 @@ def as_stored(again: Again, stored: Mapping[str, Mapping[str, Any] | None]) -> t
     """
     agreement, certified, verification = Agreement(), again.certified, again.verification
     if certified is not None:
-        certified = _certified_as_stored(again, certified, _stored_certificate(stored), agreement)
+        certified = _certified_as_stored(again, certified, stored_certificate(stored), agreement)
     found = stored.get(VERIFICATION_FILE)
     if verification is not None and found is not None:
         verification = Figures(verification).taken(VERIFICATION_FILE, found, agreement)
@@ -242,7 +242,7 @@ def as_stored(again: Again, stored: Mapping[str, Mapping[str, Any] | None]) -> t
     return replace(again, certified=certified, verification=verification), agreement
 
 
-def _stored_certificate(stored: Mapping[str, Mapping[str, Any] | None]) -> Mapping[str, Any]:
+def stored_certificate(stored: Mapping[str, Mapping[str, Any] | None]) -> Mapping[str, Any]:
     """Or as much of it as the outcome has: a unit that failed has none."""
     found = stored.get(CERTIFICATE)
     measured = (stored.get(ATTACHMENT) or {}).get("measured")

@@ -13,6 +13,7 @@ from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
 from triaxcald.audit.figures import SHARE, Agreement
 from triaxcald.audit.many import Audited
+from triaxcald.audit.within import Moved, Within
 
 _LONGEST = 60
 
@@ -25,7 +26,8 @@ def _what(of: Difference) -> str:
     place, stored, again = of.place, _short(of.stored), _short(of.again)
     match of.kind:
         case Kind.VALUE:
-            return f"{place}: stored {stored}, computed again {again}"
+            share = "" if of.of_uncertainty is None else f" ({_shown(of.of_uncertainty)} of its uncertainty)"
+            return f"{place}: stored {stored}, computed again {again}{share}"
         case Kind.BYTES:
             return "the bytes differ, the content does not"
         case Kind.MORE:
@@ -119,13 +121,38 @@ def heading(of: Audit) -> str:
 
 
 def _result(of: Audit) -> str:
+    if of.within is not None:
+        return _result_within(of, of.within)
     match of.result:
         case Result.DIFFERS:
             return f"differs from what triaxcal {of.made_by} computed{_furthest(of)}" if of.made_by else "differs"
         case Result.SAME_FIGURES:
             return f"the same figures (largest difference {_largest(of.agreement)}; {_where(of)})"
-        case Result.SAME_BYTES:
+        case _:
             return f"the same as triaxcal {of.made_by} computed" if of.made_by else "the same, byte for byte"
+
+
+def _result_within(of: Audit, within: Within) -> str:
+    """Of a recording of other software, where figures may be off by a share of their
+    uncertainties."""
+    by = ", ".join(f"{name} {version}" for name, version in within.by.items())
+    largest = within.largest
+    if largest is not None:
+        off = f"{_shown(largest.of_uncertainty or 0.0)} of its uncertainty, {largest.part}: {largest.place}"
+        off = f" (largest difference {off})"
+    else:
+        off = "" if within.moved else " (no figure differs)"
+    match of.result:
+        case Result.DIFFERS:
+            return f"differs from what {by} computed{off}"
+        case Result.WITHIN:
+            return f"within {within.limit:g} of the uncertainties of what {by} computed{off}"
+        case _:
+            return f"the same as {by} computed{off}"
+
+
+def _shown(share: float) -> str:
+    return f"{share:.2g}"
 
 
 def _furthest(of: Audit) -> str:
@@ -195,6 +222,28 @@ def document(of: Audited) -> dict[str, Any]:
         "result": found.result.value if found else None,
         "largest_difference": _agreement(found.agreement) if found else None,
         "computer": dict(zip(("then", "now"), map(dict, found.computed_on), strict=True)) if found else None,
+        "within": _within(found.within) if found and found.within else None,
+    }
+
+
+def _within(of: Within) -> dict[str, Any]:
+    """Every figure that is off, and the one that is furthest off in its uncertainty."""
+    return {
+        "limit": of.limit,
+        "by": dict(of.by),
+        "largest": _moved(of.largest) if of.largest else None,
+        "figures": [_moved(figure) for figure in of.moved],
+    }
+
+
+def _moved(of: Moved) -> dict[str, Any]:
+    return {
+        "part": of.part,
+        "place": of.place,
+        "stored": of.stored,
+        "again": of.again,
+        "uncertainty": of.uncertainty,
+        "of_uncertainty": of.of_uncertainty,
     }
 
 

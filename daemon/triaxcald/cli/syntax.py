@@ -791,6 +791,7 @@ def _audits(commands: Any) -> None:
         computes=True,
     )  # fmt: skip
     p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
+    _add_other_versions(p)
     add_json(p)
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
     parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
@@ -822,3 +823,16 @@ def _audits(commands: Any) -> None:
     p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
     _add_selection(p)
     add_json(p)
+
+
+def _add_other_versions(p: argparse.ArgumentParser) -> None:
+    """Of an audit: recordings that other versions made."""
+    p.add_argument(
+        "--within", metavar="X", type=positive,
+        help="figures of another triaxcal, numpy or scipy may be off by so much of their uncertainty, as 0.01",
+    )  # fmt: skip
+    p.add_argument(
+        "--as-made", action="store_true",
+        help="audit under the versions that made the recording, in an environment built of --wheels",
+    )  # fmt: skip
+    p.add_argument("--wheels", metavar="FOLDER", type=Path, help="with wheels of these versions; nothing is downloaded")
