@@ -1,4 +1,4 @@
-"""audit, log."""
+"""log."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from typing import Any, BinaryIO
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.abort import AbortNotice, at_abort
-from triaxcald.cli.console import at, emit, say, show
+from triaxcald.cli.console import emit, say, show
 from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
@@ -27,31 +26,6 @@ from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Contents, open_recording
 from triaxcald.recording.recover import recover
 from triaxcald.tables.native_csv import Rows, write_csv
-
-
-def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import Audited, audit_each, text, to_audit, worst  # the whole line, which no `log` needs
-
-    asked = to_audit(a.recordings)
-    audited: list[Audited] = []
-    with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
-        for one in audit_each(asked, lambda path: at(f"auditing {path}")):
-            audited.append(one)
-            if one.audit is None:
-                say(f"triaxcal: {one.error}")
-            elif not a.json:
-                show(text.heading(one.audit))
-                for line in map(text.difference, one.audit.differences):
-                    show(f"  {line}")
-                for line in text.notes(one.audit.notes):
-                    show(f"  note: {line}")
-                sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
-    if a.json:
-        emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
-              "summary": text.counts(audited)})  # fmt: skip
-    elif len(audited) > 1:
-        show(text.summary(audited))
-    return worst(audited)
 
 
 def info_command(a: argparse.Namespace) -> int:
