@@ -23,12 +23,14 @@ from triaxcald.many import (
     Done,
     Found,
     Pace,
+    Row,
     Settings,
     Source,
     Table,
     Unusable,
     Work,
     attempt,
+    is_current,
     open_table,
     sources_of,
     unusable,
@@ -47,7 +49,9 @@ WAITING_S = 30.0
 @dataclass(frozen=True)
 class Job:
     """What is done at each of the recordings ``found``. ``each`` shows a result,
-    ``stopped`` says at an interrupt how far it came."""
+    ``stopped`` says at an interrupt how far it came. ``is_whole``: all that a stored
+    row tells of is there; ``refusal`` says why a recording is not worked at, by its
+    stored row."""
 
     command: str
     doing: str
@@ -57,6 +61,8 @@ class Job:
     found: Sequence[Found]
     each: Callable[[Done], None]
     stopped: Callable[[], str]
+    is_whole: Callable[[Row], bool] = lambda row: True
+    refusal: Callable[[Source, Row | None], str | None] = lambda source, row: None
 
 
 def run_job(job: Job, a: argparse.Namespace) -> int:
@@ -116,16 +122,19 @@ class _Engine:
         """None where there is work to do."""
         if isinstance(of, Unusable):
             return self._stored(unusable(of, of.error, of.exit_code, self._settings))
-        row = self._table.known(of, self._settings)
-        if row is None:
-            return None
-        self._pace.skip(1)
-        return Done(of.name, row)
+        row = self._table.stored(of.name)
+        if row is not None and is_current(row, of, self._settings) and self._job.is_whole(row):
+            self._pace.skip(1)
+            return Done(of.name, row)
+        if (why := self._job.refusal(of, row)) is not None:
+            return self._stored(unusable(of, why, BAD_INPUT, self._settings))
+        return None
 
     def _stored(self, done: Done) -> Done:
+        before = self._table.stored(done.name) if done.written else None
         self._table.store(done.row)
         self._pace.another(time.monotonic())
-        return published(done, self._table)
+        return published(done, self._table, before)
 
     def _tell(self, what: str = "") -> None:
         if self._pace.total == 1:
@@ -186,15 +195,18 @@ class _Elsewhere(_Engine):
         self._tell("" if workers else "; no worker")
 
 
-def published(done: Done, table: Table) -> Done:
+def published(done: Done, table: Table, before: Row | None) -> Done:
     """Gives the file that the work has written its name, now that its row is stored:
-    never over another file."""
+    over the file that the row ``before`` tells of, never over another one."""
     if done.written is None:
         return done
     temporary, final = map(Path, done.written)
     try:
-        os.link(temporary, final)
-        temporary.unlink()
+        if before is not None and before.get("output") == str(final):
+            os.replace(temporary, final)
+        else:
+            os.link(temporary, final)
+            temporary.unlink()
         return done
     except FileExistsError:
         temporary.unlink(missing_ok=True)

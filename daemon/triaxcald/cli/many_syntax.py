@@ -5,13 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from triaxcald.cli.syntax import add_command, add_json, count, size
+from triaxcald.cli.syntax import (
+    add_applying,
+    add_command,
+    add_error_limit,
+    add_json,
+    add_measuring,
+    add_moment,
+    add_residual_limit,
+    add_table,
+    add_uncertainty,
+    add_ways,
+    count,
+    size,
+)
 
 WHICH = "REC|FOLDER|GLOB|LIST|URL"
 
 
 def register_many(commands: Any) -> None:
     _audit(commands)
+    _batch(commands)
 
 
 def add_many(p: Any, table: bool = False) -> None:
@@ -47,3 +61,52 @@ def _audit(commands: Any) -> None:
     )  # fmt: skip
     add_many(p)
     add_json(p)
+
+
+def _batch(commands: Any) -> None:
+    batch = commands.add_parser("batch", help="a command at many recordings, into one table")
+    parts = batch.add_subparsers(dest="part", required=True, metavar="poses|fit|diagnose|verify|apply")
+    p = _part(parts, "poses", "count the still poses of many recordings, and their noise")
+    add_measuring(p)
+    add_table(p)
+    p = _part(parts, "fit", "fit the linear model to each of many recordings")
+    add_measuring(p)
+    add_ways(p)
+    add_uncertainty(p)
+    add_residual_limit(p)
+    add_table(p)
+    p = _part(parts, "diagnose", "diagnose each of many recordings by itself")
+    add_measuring(p)
+    add_uncertainty(p)
+    add_moment(p)
+    add_residual_limit(p)
+    add_table(p)
+    p = _part(parts, "verify", "verify many recordings under a calibration", "--calibration beside")
+    _add_calibration(p)
+    add_measuring(p)
+    add_error_limit(p)
+    add_table(p)
+    p = _part(parts, "apply", "write calibrated readings of many recordings", "--calibration beside --to calibrated")
+    _add_calibration(p)
+    p.add_argument(
+        "--to", type=Path, metavar="FOLDER", required=True,
+        help="for NAME.csv of each recording; one that is there is not overwritten",
+    )  # fmt: skip
+    p.add_argument("--format", dest="kind", choices=("csv", "csv.gz", "parquet"), default="csv", help="of these files")
+    add_applying(p)
+    add_table(p)
+
+
+def _part(parts: Any, name: str, help_line: str, options: str = "") -> Any:
+    example = f"batch {name} recordings/ {options} -o {name}.parquet".replace("  ", " ")
+    p = add_command(parts, name, "batch:batch_command", help_line, "", example, computes=True)
+    add_many(p, table=True)
+    return p
+
+
+def _add_calibration(p: Any) -> None:
+    p.add_argument(
+        "--calibration", metavar="CAL|beside", required=True,
+        help="a calibration, loop or certificate document; beside: of each recording NAME.cal.json, else "
+        "NAME.calibration.json or NAME.certificate.json",
+    )  # fmt: skip

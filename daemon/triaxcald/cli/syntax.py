@@ -181,6 +181,13 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
         recording.nargs, recording.required = "?", False
     if several:
         recording.nargs = "+"
+    add_measuring(parser)
+    add_json(parser)
+    add_table(parser)
+
+
+def add_measuring(parser: argparse.ArgumentParser) -> None:
+    """What the readings are and what they measure."""
     parser.add_argument("--sign", type=signs, metavar="S,S,S", help="signs of the scale factors; write --sign=-,-,-")
     parser.add_argument("--output-unit", metavar="UNIT", help="unit of the readings, for the documents")
     parser.add_argument(
@@ -190,8 +197,6 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
         help="magnitude of the reference vector in its own unit; default: the recording's, else 1 g",
     )
     parser.add_argument("--reference-unit", metavar="UNIT", help="that unit, for the documents")
-    add_json(parser)
-    add_table(parser)
 
 
 def add_table(parser: argparse.ArgumentParser) -> None:
@@ -474,7 +479,7 @@ def _on_recordings(commands: Any) -> None:
         computes=True,
     )  # fmt: skip
     add_recording(p)
-    _add_ways(p)
+    add_ways(p)
     _add_results(p)
     p = add_command(
         commands, "diagnose", "fitting:diagnose_command", "find, add and judge effects that the linear model lacks",
@@ -488,10 +493,7 @@ def _on_recordings(commands: Any) -> None:
         "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
     )
     p.add_argument("--verbose", action="store_true", help="tables too: errors, probabilities, coefficients, budget")
-    p.add_argument(
-        "--at", type=moment, metavar="end|mean|SECONDS",
-        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
-    )  # fmt: skip
+    add_moment(p)
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p = add_command(
         commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",
@@ -512,13 +514,7 @@ def _on_recordings(commands: Any) -> None:
     p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
     p.add_argument("recording", metavar="REC", help=RECORDING)
     p.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help=".csv, .csv.gz or .parquet")
-    p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
-    p.add_argument(
-        "--own-recording", action="store_true",
-        help="REC is the recording that was calibrated: effects of time at each of its times",
-    )  # fmt: skip
-    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
-    p.add_argument("--output-unit", metavar="UNIT", help="unit of REC's outputs, whatever its header says")
+    add_applying(p)
     add_table(p)
     p = add_command(
         commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",
@@ -528,11 +524,32 @@ def _on_recordings(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL.json")
     add_recording(p)
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this, in g")
+    add_error_limit(p)
     _frame(commands)
 
 
-def _add_ways(parser: argparse.ArgumentParser) -> None:
+def add_moment(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--at", type=moment, metavar="end|mean|SECONDS",
+        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
+    )  # fmt: skip
+
+
+def add_applying(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
+    p.add_argument(
+        "--own-recording", action="store_true",
+        help="REC is the recording that was calibrated: effects of time at each of its times",
+    )  # fmt: skip
+    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
+    p.add_argument("--output-unit", metavar="UNIT", help="unit of REC's outputs, whatever its header says")
+
+
+def add_error_limit(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this, in g")
+
+
+def add_ways(parser: argparse.ArgumentParser) -> None:
     ways = parser.add_mutually_exclusive_group()
     ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
     ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
@@ -571,6 +588,10 @@ def _add_results(p: argparse.ArgumentParser) -> None:
 def _add_files(p: argparse.ArgumentParser) -> None:
     p.add_argument("-o", "--output", type=Path, metavar="CAL.json", help="the document; not a file that is read")
     p.add_argument("--report", type=Path, metavar="R.html", help="the same for people, in one file")
+    add_residual_limit(p)
+
+
+def add_residual_limit(p: argparse.ArgumentParser) -> None:
     p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this, in g")
 
 

@@ -50,24 +50,24 @@ def open_table(path: Path | None, command: str, columns: Sequence[Column[Any]], 
     return kind(path, command, columns, resume=resume)
 
 
+def is_current(row: Row, of: Source, settings: Settings) -> bool:
+    """Whether the row is of a recording that has not changed since, by the same
+    software and settings, and would not come out otherwise another time."""
+    if row["exit_code"] in _AGAIN or not (of.stamp or of.size):
+        return False
+    now = (of.size, of.stamp, settings.software, settings.digest)
+    return now == (row["size"], row["stamp"], row["software"], row["settings"])
+
+
 class Table(ABC):
     """A context manager. Rows are durable when `store` returns."""
 
     def __init__(self, columns: Sequence[Column[Any]]) -> None:
         self.columns = columns
 
-    def known(self, source: Source, settings: Settings) -> Row | None:
-        """The stored row of a recording that has not changed since, by the same
-        software and settings; None where it is to be made again."""
-        row = self._stored(source.name)
-        if row is None or row["exit_code"] in _AGAIN or not (source.stamp or source.size):
-            return None
-        now = (source.size, source.stamp, settings.software, settings.digest)
-        then = (row["size"], row["stamp"], row["software"], row["settings"])
-        return row if now == then else None
-
     @abstractmethod
-    def _stored(self, name: str) -> Row | None: ...
+    def stored(self, name: str) -> Row | None:
+        """The latest row of a recording."""
 
     @abstractmethod
     def store(self, row: Row) -> None:
@@ -92,7 +92,7 @@ class Table(ABC):
 
 
 class _Nowhere(Table):
-    def _stored(self, name: str) -> Row | None:
+    def stored(self, name: str) -> Row | None:
         return None
 
     def store(self, row: Row) -> None:
@@ -174,7 +174,7 @@ class FileTable(Table):
             os.fsync(self._journal.fileno())
         return at
 
-    def _stored(self, name: str) -> Row | None:
+    def stored(self, name: str) -> Row | None:
         at = self._offsets.get(name)
         if at is None:
             return None
@@ -194,7 +194,7 @@ class FileTable(Table):
 
     def finish(self, order: Iterable[str]) -> None:
         names = dict.fromkeys([*(n for n in order if n in self._offsets), *self._offsets])
-        rows = (self._cells(row) for name in names if (row := self._stored(name)) is not None)
+        rows = (self._cells(row) for name in names if (row := self.stored(name)) is not None)
         try:
             with new_beside(self._path) as beside:
                 self._write(beside, rows)
@@ -297,7 +297,7 @@ class SqliteTable(Table):
         self._db.execute("COMMIT")
         self._put = f"INSERT OR REPLACE INTO recordings VALUES ({', '.join('?' * len(names))})"
 
-    def _stored(self, name: str) -> Row | None:
+    def stored(self, name: str) -> Row | None:
         cells = self._db.execute("SELECT * FROM recordings WHERE recording = ?", (name,)).fetchone()
         return None if cells is None else dict(zip((c.name for c in self.columns), cells, strict=True))
 

@@ -122,8 +122,11 @@ def attempt(work: Work, source: Source, settings: Settings) -> Done:
         with bounded(settings.memory):
             finding = work(path)
             digest = digest_of(path)
+    except tc.Refused as e:
+        wanted = f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""
+        finding = failed(f"{source.name}: refused: {e}{wanted}", exit_code_of(e))
     except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
-        finding = failed(str(e), exit_code_of(e))
+        finding = failed(str(e) if source.name in str(e) else f"{source.name}: {e}", exit_code_of(e))
     except Exception as e:  # noqa: BLE001 - the one place that supervises work at many recordings
         if ran_out_of_memory(e):
             e.__traceback__ = e.__context__ = None  # and all that its frames hold
