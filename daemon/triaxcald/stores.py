@@ -236,7 +236,8 @@ def _told(url: str) -> Iterator[None]:
     except ImportError as e:
         if isinstance(e, ModuleNotFoundError) and td.hints.lacking(e):
             raise
-        raise InputError(f"{url}: {_one_line(e)}") from e
+        lacking = td.hints.lacking(e.__cause__) if isinstance(e.__cause__, ModuleNotFoundError) else None
+        raise InputError(f"{url}: {lacking or _one_line(e)}") from e
     except FileNotFoundError as e:
         raise FileNotFoundError(errno.ENOENT, "there is no such file in the store") from e
     except PermissionError as e:

@@ -120,10 +120,19 @@ UNITS = """The columns of `--units`:
 
 def page() -> str:
     commands = dict(commands_of(parser()))
-    shared = _shared(commands.values())
+    of_command = {
+        name: {_key(a) for a in options(commands[name.removeprefix("batch ")])} for name in commands if _many(name)
+    }
+    shared = _shared([a for name, p in commands.items() for a in options(p) if _key(a) not in of_command.get(name, ())])
     tables = {o for g in commands["poses"]._action_groups if g.title == "tables" for o in names(g._group_actions)}
     head = HEAD + _table(list(shared.values()))
-    return "\n".join([head, *(_section(name, p, shared, tables) for name, p in commands.items())])
+    known = {name: {*shared, *of_command.get(name, ())} for name in commands}
+    return "\n".join([head, *(_section(name, p, known[name], tables) for name, p in commands.items())])
+
+
+def _many(name: str) -> bool:
+    """A command at many recordings has options of the command itself."""
+    return name.startswith("batch ")
 
 
 Key = tuple[tuple[str, ...], str | None, str]
@@ -134,9 +143,9 @@ def _key(a: argparse.Action) -> Key:
     return tuple(a.option_strings), a.help, _default(a)
 
 
-def _shared(commands: Iterable[argparse.ArgumentParser]) -> dict[Key, argparse.Action]:
+def _shared(every: Iterable[argparse.Action]) -> dict[Key, argparse.Action]:
     """The options that several commands have alike."""
-    every = [a for p in commands for a in options(p)]
+    every = list(every)
     count = Counter(map(_key, every))
     return {_key(a): a for a in every if count[_key(a)] > 1 and a.help}
 

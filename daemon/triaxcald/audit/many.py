@@ -9,10 +9,13 @@ from triaxcald.audit import text
 from triaxcald.audit.conduct import Audit, audit
 from triaxcald.errors import DONE, OUTSIDE
 from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding
+from triaxcald.many.sources import LIST
 from triaxcald.schema.columns import Kind
 
 ENDINGS: Final = (".mcap",)
 """Ends of names of recordings in a folder."""
+MANIFESTS: Final = (*LIST, ".txt")
+"""Ends of names of manifests: no text is a recording that could be audited."""
 
 COLUMNS: Final[tuple[Column[Audit], ...]] = (
     *COMMON_BEFORE,

@@ -234,7 +234,7 @@ def said_options(options: dict[str, Any]) -> str:
 def audit_command(a: argparse.Namespace) -> int:
     from triaxcald.audit import many, text  # the whole line, which no other command needs
 
-    found = sources_of(a.recordings, many.ENDINGS, without=own_files(a))
+    found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS)
     if a.resume and a.output is None:
         raise InputError("--resume: give the table that is to be finished: -o TABLE")
     counts: Counter[str] = Counter()

@@ -20,7 +20,7 @@ from triaxcald.cli.syntax import (
     size,
 )
 
-WHICH = "REC|FOLDER|GLOB|LIST|URL"
+WHICH = "REC|FOLDER|GLOB|MANIFEST|URL"
 
 
 def register_many(commands: Any) -> None:
@@ -33,7 +33,7 @@ def add_many(p: Any, table: bool = False) -> None:
     have to go somewhere."""
     p.add_argument(
         "recordings", metavar=WHICH, nargs="+",
-        help="recordings, folders, patterns, lists (.list) with a path or URL a line, and URLs (s3://…)",
+        help="recordings, folders, patterns, manifests (.list: a path or URL a line), and URLs (s3://…)",
     )  # fmt: skip
     p.add_argument(
         "-o", "--output", type=Path, metavar="TABLE", required=table,

@@ -4,6 +4,7 @@ dask and distributed."""
 from __future__ import annotations
 
 import logging
+import os
 import queue
 import shutil
 import signal
@@ -27,7 +28,7 @@ AHEAD: Final = 2
 through. More would be blamed for a worker that dies."""
 DEATHS: Final = 1
 """On a cluster of our own: a recording whose worker dies more often is set aside."""
-CONNECT_S: Final = 15.0
+CONNECT_S: Final = 10.0
 LOOK_S: Final = 1.0
 """Between two looks at who works."""
 TERMINATE_SHARE: Final = 1.1
@@ -42,6 +43,8 @@ _CONFIG: Final = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": TERMINATE_SHARE,
     "distributed.comm.timeouts.connect": f"{CONNECT_S:.0f}s",
+    "distributed.scheduler.http.routes": [],  # nobody is to look on
+    "distributed.worker.http.routes": [],
 }
 
 
@@ -76,6 +79,7 @@ def local_cluster(jobs: int, memory: int | None) -> Iterator[Cluster]:
         stack.enter_context(dask.config.set(_CONFIG))
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="triaxcal-", ignore_cleanup_errors=True))
         stack.enter_context(at_abort(lambda _: shutil.rmtree(folder, ignore_errors=True)))
+        _start_quiet_tracker()
         cluster = _deaf_to_signals(
             lambda: distributed.LocalCluster(
                 n_workers=jobs,
@@ -83,7 +87,8 @@ def local_cluster(jobs: int, memory: int | None) -> Iterator[Cluster]:
                 processes=True,
                 memory_limit=memory if memory is not None else 0,  # 0: none
                 host="127.0.0.1",
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
                 security=distributed.Security.temporary(),
                 silence_logs=logging.CRITICAL + 1,
                 local_directory=folder,
@@ -122,6 +127,22 @@ def _quietly(close: Callable[[], object]) -> None:
     """What ends late or not at all is no matter once the results are there."""
     with suppress(OSError, TimeoutError, RuntimeError):
         close()
+
+
+def _start_quiet_tracker() -> None:
+    """Python's own process that clears up after processes that end at once, as this one
+    does at a signal. It warns of what it finds, which is as it should be."""
+    from multiprocessing import resource_tracker
+
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _deaf_to_signals(make: Callable[[], T]) -> T:

@@ -15,7 +15,7 @@ from triaxcald.files import is_of_the_disk
 from triaxcald.stores import Listed, StoreFile, files_like, files_under, is_url, path_of
 
 LIST: Final = (".list", ".manifest")
-"""Ends of names of a list of recordings, one a line."""
+"""Ends of names of a manifest: a list of recordings, one a line."""
 LIST_MOST: Final = 2**29
 """Bytes of a list: four million paths."""
 LINE_MOST: Final = 4096
@@ -46,15 +46,18 @@ class Unusable:
 Found = Source | Unusable
 
 
-def sources_of(asked: Sequence[str], endings: tuple[str, ...], *, without: Iterable[Path] = ()) -> list[Found]:
+def sources_of(
+    asked: Sequence[str], endings: tuple[str, ...], *, without: Iterable[Path] = (), lists: tuple[str, ...] = LIST
+) -> list[Found]:
     """Recordings, folders of recordings, patterns, lists and URLs, in the order in
     which they are given, each recording once. What names no recording is its own error.
-    ``endings`` are those of recordings in a folder; the files ``without`` are none."""
+    ``endings`` are those of recordings in a folder, ``lists`` those of manifests; the
+    files ``without`` are none."""
     own = {path.absolute() for path in without}
     found: dict[str, Found] = {}
     for given in asked:
         try:
-            for source in _sources_of(given, endings):
+            for source in _sources_of(given, endings, lists):
                 if not own or is_url(source.name) or Path(source.name).absolute() not in own:
                     found.setdefault(source.name, source)
         except DaemonError as e:
@@ -65,9 +68,9 @@ def sources_of(asked: Sequence[str], endings: tuple[str, ...], *, without: Itera
     return list(found.values())
 
 
-def _sources_of(given: str, endings: tuple[str, ...]) -> Iterable[Found]:
+def _sources_of(given: str, endings: tuple[str, ...], lists: tuple[str, ...]) -> Iterable[Found]:
     """Raises InputError, OSError."""
-    if given.endswith(LIST) and not _is_folder(given):
+    if given.endswith(lists) and not _is_folder(given):
         return list(_of_list(given))
     if is_url(given) and not given.startswith("file://"):
         return _in_store(given, endings)
