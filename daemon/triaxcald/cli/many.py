@@ -153,7 +153,8 @@ class _Here(_Engine):
                 yield known
             elif isinstance(of, Source):
                 self._tell()
-                yield self._stored(attempt(self._job.work, of, self._settings))
+                supervised = self._pace.total > 1  # of one alone the trace tells more
+                yield self._stored(attempt(self._job.work, of, self._settings, supervised=supervised))
 
 
 class _Elsewhere(_Engine):

@@ -10,6 +10,7 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -192,6 +193,8 @@ class _Run:
         self._suspects: deque[Source] = deque()
         self._id = uuid.uuid4().hex[:12]
         self._handed_out = 0
+        self._workers = self._thread_count = 0
+        self._looked_s = -LOOK_S
 
     def through(self, sources: Iterator[Source]) -> Iterator[Done]:
         more = True
@@ -210,10 +213,16 @@ class _Run:
                     yield done
 
     def _threads(self) -> int:
-        """Of the cluster, as the client has last heard."""
-        workers = self._cluster.client.scheduler_info(n_workers=-1).get("workers", {})
-        self._workers = len(workers)
-        return sum(int(worker.get("nthreads", 1)) for worker in workers.values())
+        """Of the cluster, asked for every `LOOK_S`: workers come and go. Raises
+        StationError."""
+        if (now := time.monotonic()) - self._looked_s >= LOOK_S:
+            self._looked_s = now
+            try:
+                workers = self._cluster.client.nthreads()
+            except (OSError, TimeoutError) as e:
+                raise self._lost() from e
+            self._workers, self._thread_count = len(workers), sum(workers.values())
+        return self._thread_count
 
     def _hand_out(self, source: Source) -> None:
         self._handed_out += 1

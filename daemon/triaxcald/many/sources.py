@@ -70,6 +70,8 @@ def sources_of(
 
 def _sources_of(given: str, endings: tuple[str, ...], lists: tuple[str, ...]) -> Iterable[Found]:
     """Raises InputError, OSError."""
+    if given == "-":
+        raise InputError("-: standard input is no recording among many; give files")
     if given.endswith(lists) and not _is_folder(given):
         return list(_of_list(given))
     if is_url(given) and not given.startswith("file://"):

@@ -12,6 +12,7 @@ import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -88,7 +89,15 @@ class Table(ABC):
         self.close()
 
     def _cells(self, row: Mapping[str, Any]) -> list[Any]:
-        return [row.get(column.name) for column in self.columns]
+        return [_plain(row.get(column.name)) for column in self.columns]
+
+
+def _plain(cell: Any) -> Any:
+    """As every kind of table can hold it: names of files may be no text, and figures no
+    numbers."""
+    if isinstance(cell, str):
+        return cell.encode("utf-8", "backslashreplace").decode()
+    return None if isinstance(cell, float) and not isfinite(cell) else cell
 
 
 class _Nowhere(Table):
@@ -168,14 +177,14 @@ class FileTable(Table):
 
     def _append(self, value: Mapping[str, Any], *, durable: bool = True) -> int:
         at = self._journal.seek(0, os.SEEK_END)
-        self._journal.write(json.dumps(value, ensure_ascii=False, allow_nan=False).encode("utf-8", "replace") + b"\n")
+        self._journal.write(json.dumps(value, ensure_ascii=False, allow_nan=False).encode() + b"\n")
         if durable:
             self._journal.flush()
             os.fsync(self._journal.fileno())
         return at
 
     def stored(self, name: str) -> Row | None:
-        at = self._offsets.get(name)
+        at = self._offsets.get(_plain(name))
         if at is None:
             return None
         self._journal.seek(at)
@@ -184,16 +193,14 @@ class FileTable(Table):
 
     def store(self, row: Row) -> None:
         try:
-            self._offsets[str(row["recording"])] = self._append(dict(zip(self._names, self._cells(row), strict=True)))
+            cells = dict(zip((column.name for column in self.columns), self._cells(row), strict=True))
+            self._offsets[cells["recording"]] = self._append(cells)
         except OSError as e:
             raise DiskError(f"{self._journal_path}: cannot be written: {e.strerror}; --resume goes on") from e
 
-    @property
-    def _names(self) -> list[str]:
-        return [column.name for column in self.columns]
-
     def finish(self, order: Iterable[str]) -> None:
-        names = dict.fromkeys([*(n for n in order if n in self._offsets), *self._offsets])
+        asked = (_plain(name) for name in order)
+        names = dict.fromkeys([*(n for n in asked if n in self._offsets), *self._offsets])
         rows = (self._cells(row) for name in names if (row := self.stored(name)) is not None)
         try:
             with new_beside(self._path) as beside:
@@ -298,7 +305,7 @@ class SqliteTable(Table):
         self._put = f"INSERT OR REPLACE INTO recordings VALUES ({', '.join('?' * len(names))})"
 
     def stored(self, name: str) -> Row | None:
-        cells = self._db.execute("SELECT * FROM recordings WHERE recording = ?", (name,)).fetchone()
+        cells = self._db.execute("SELECT * FROM recordings WHERE recording = ?", (_plain(name),)).fetchone()
         return None if cells is None else dict(zip((c.name for c in self.columns), cells, strict=True))
 
     def store(self, row: Row) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -109,11 +110,21 @@ class WrongVersion(DaemonError):
     """A worker has another version of triaxcal than this process."""
 
 
-def attempt(work: Work, source: Source, settings: Settings) -> Done:
-    """Raises WrongVersion; every other error is the recording's row."""
+_one_at_a_time = threading.Lock()
+"""The limit of memory is the process's: threads of a worker wait for each other."""
+
+
+def attempt(work: Work, source: Source, settings: Settings, *, supervised: bool = True) -> Done:
+    """Raises WrongVersion; every other error is the recording's row, one that nobody
+    foresaw only if the work is ``supervised``."""
     here = version("triaxcal")
     if here != settings.software:
         raise WrongVersion(f"a worker has triaxcal {here}, expected {settings.software}")
+    with _one_at_a_time:
+        return _attempt(work, source, settings, here, supervised)
+
+
+def _attempt(work: Work, source: Source, settings: Settings, here: str, supervised: bool) -> Done:
     began_s = time.monotonic()
     path = path_of(source.name)
     digest = None
@@ -127,12 +138,14 @@ def attempt(work: Work, source: Source, settings: Settings) -> Done:
         finding = failed(f"{source.name}: refused: {e}{wanted}", exit_code_of(e))
     except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         finding = failed(str(e) if source.name in str(e) else f"{source.name}: {e}", exit_code_of(e))
-    except Exception as e:  # noqa: BLE001 - the one place that supervises work at many recordings
+    except Exception as e:
         if ran_out_of_memory(e):
             e.__traceback__ = e.__context__ = None  # and all that its frames hold
             finding = failed(f"{source.name}: {out_of_memory(e)}", exit_code_of(e))
         elif isinstance(e, ModuleNotFoundError) and (lacking := td.hints.lacking(e)):
             finding = failed(f"{source.name}: {lacking}", 2)
+        elif not supervised:
+            raise
         else:
             finding = failed(f"{source.name}: internal error: {type(e).__name__}: {e}", DEVICE)
     row = {

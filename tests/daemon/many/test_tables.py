@@ -206,3 +206,45 @@ def test_rows_of_other_columns_are_made_again(tmp_path: Path) -> None:
         found = table.stored("a")
     assert found is not None
     assert found["new"] == "x"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_name_that_is_no_text_and_a_figure_that_is_no_number(tmp_path: Path, name: str) -> None:
+    odd = "r/\udcff.mcap"
+    with opened(tmp_path / name) as table:
+        table.store(row_of(odd, value=float("nan"), error="half \ud800"))
+        table.finish([odd])
+    with opened(tmp_path / name, resume=True) as table:
+        found = table.stored(odd)
+    assert found == row_of("r/\\udcff.mcap", value=None, error="half \\ud800")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["t.csv", "t.sqlite"])
+def test_a_disk_that_takes_no_more_is_5_and_the_rest_resumes(tmp_path: Path, name: str) -> None:
+    """A file of 40 KiB at most stands for the full disk."""
+    path = tmp_path / name
+    code = f"""
+import resource, signal
+from pathlib import Path
+from tests.daemon.many.test_tables import opened, row_of
+from triaxcald.errors import DiskError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (40 * 1024, 40 * 1024))
+with opened(Path({str(path)!r})) as table:
+    for count in range(10_000):
+        try:
+            table.store(row_of(f"r{{count}}"))
+        except DiskError as e:
+            print(count, e.exit_code, e)
+            break
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True, timeout=120
+    )
+    count, code_, words = done.stdout.split(" ", 2)
+    assert code_ == "5"
+    assert "--resume goes on" in words
+    with opened(path, resume=True) as table:
+        for i in range(int(count)):
+            assert table.stored(f"r{i}") == row_of(f"r{i}")

@@ -59,6 +59,11 @@ def test_every_error_is_a_row_that_names_the_recording(source: Source, error: Ex
     assert "\n" not in done.error
 
 
+def test_an_error_in_the_one_recording_asked_for_keeps_its_trace(source: Source) -> None:
+    with pytest.raises(AttributeError, match="no such thing"):
+        attempt(works.breaks, source, Settings("d1"), supervised=False)
+
+
 def test_another_version_is_no_row(source: Source) -> None:
     with pytest.raises(WrongVersion, match="expected 99"):
         attempt(works.tells, source, Settings("d1", "99"))
