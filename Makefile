@@ -56,6 +56,7 @@ docs: $(SITE)  ## pages and the picture made from the code, the notebook with it
 	$(BIN)/python docs/reference/documents.py
 	$(BIN)/python docs/reference/effects.py
 	$(BIN)/python docs/reference/cli.py
+	$(BIN)/python docs/reference/many.py
 	$(BIN)/python docs/reference/misbehaving-devices.py
 	$(BIN)/python docs/reference/profile-keys.py
 	$(BIN)/python docs/pictures/before_after.py

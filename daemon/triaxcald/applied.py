@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
 from triaxcald.provision.correction import from_attachments, samples_before
 from triaxcald.recording.reader import is_recording, open_recording
 from triaxcald.recording.schema import Phase
+from triaxcald.stores import path_of
 from triaxcald.tables.native_csv import Rows
 from triaxcald.tables.samples import Reading, read_table
 
@@ -60,8 +60,8 @@ def applied(
     found = Applied(iter(()), None)
     beside: Mapping[str, Any] = {}
     if is_recording(name):
-        blocks = _of_recording(Path(name), phase)
-        whole = _of_recording(Path(name), phase)
+        blocks = _of_recording(path_of(name), phase)
+        whole = _of_recording(path_of(name), phase)
         pieces: Iterator[tuple[Any, Mapping[str, Any]]] = ((b.time_ns * 1e-9, b.channels) for b in whole if len(b))
     else:
         table = read_table(name, reading, beside=True)
@@ -143,7 +143,7 @@ def _of_another_unit(calibration: tc.Calibration, name: str, lengths: list[float
     ]
 
 
-def _of_recording(path: Path, phase: Phase) -> Iterator[td.SampleBlock]:
+def _of_recording(path: td.files.AnyPath, phase: Phase) -> Iterator[td.SampleBlock]:
     with open_recording(path) as recording:
         bundle = bundle_of(recording)
         stream = DecodedStream(bundle, td.READINGS)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from triaxcald.recording.schema import CALIBRATION as CALIBRATION
 from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.station.config import parse_station
+from triaxcald.stores import path_of
 from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
 
@@ -85,7 +85,7 @@ def measure(
     `find_spans`.
     """
     if is_recording(name):
-        with open_recording(Path(name)) as recording:
+        with open_recording(path_of(name)) as recording:
             return _measure_recording(recording, phase, stream, moments, turn_s)
     table = read_table(name, reading)
     samples = table.samples
@@ -279,7 +279,7 @@ def read_document(path: str) -> Mapping[str, Any]:
 def document_bytes(path: str) -> bytes:
     """Of the file that is to be a JSON document. Raises InputError."""
     try:
-        return td.files.read_whole(Path(path), DOCUMENT_MOST, pipe=True)
+        return td.files.read_whole(path_of(path), DOCUMENT_MOST, pipe=True)
     except td.files.TooLarge as e:
         _require_no_other_kind(e.head, path)
         raise InputError(f"{path}: {e.strerror}") from e

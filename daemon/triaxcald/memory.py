@@ -109,6 +109,56 @@ def _threads() -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 64)
 
 
+# A bound for the work on one recording, so that one that is too large fails alone.
+
+_LEAST_ROOM_BYTES = 64 * 2**20
+"""Room that work always gets: a recording of ten minutes needs less."""
+_GIVE_BACK_SHARE = 0.75
+"""Share of the limit from which freed memory is given back first."""
+
+
+@contextmanager
+def bounded(limit: int | None) -> Iterator[None]:
+    """Within it, this process can take memory up to about ``limit`` bytes, or at least
+    64 MiB more than it has; what asks for more gets a MemoryError (Linux; elsewhere
+    there is no such limit). None is no limit."""
+    if limit is None or (now := _in_use()) is None:
+        yield
+        return
+    import resource
+
+    if now[0] > _GIVE_BACK_SHARE * limit:
+        give_back()
+        now = _in_use() or now
+    resident, data = now
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = data + max(limit - resident, _LEAST_ROOM_BYTES)
+    bounds = [b for b in (most, soft, hard) if b != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(bounds), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _in_use() -> tuple[int, int] | None:
+    """Bytes of this process that are resident, and bytes that count towards the limit
+    of its data; None where the system does not tell."""
+    try:
+        with open("/proc/self/status", encoding="ascii") as file:
+            held = dict(line.split(":", 1) for line in file)
+        resident, data = (int(held[key].split()[0]) << 10 for key in ("VmRSS", "VmData"))
+    except (OSError, ValueError, KeyError):
+        return None
+    return resident, data
+
+
+def resident_bytes() -> int | None:
+    """Memory of this process; None where the system does not tell."""
+    found = _in_use()
+    return None if found is None else found[0]
+
+
 def out_of_memory(e: BaseException) -> str:
     """In words."""
     return f"memory ran out: {e}" if str(e) else "memory ran out"

@@ -98,7 +98,14 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "token new": """Programs send `Authorization: Bearer TOKEN`. Only the SHA-256 of the token is stored. Of one name there is one token that is not revoked (exit 2).""",  # noqa: E501
     "token list": """In the order of time, revoked ones too.""",
     "token revoke": """The name is free for another token.""",
-    "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. [Years later](../how-to/replay-and-audit.md#years-later) `--within` bounds what other versions compute, and `--as-made` runs the recorded versions. A signal ends it with the number of recordings audited so far. Document `triaxcal.audit/1`.""",  # noqa: E501
+    "audit": """[What it finds](../how-to/replay-and-audit.md). A folder stands for all `.mcap` files in it and below. Exit 0 if everything is the same byte for byte, or but for last digits of another processor; exit 1 if anything differs. A signal ends it with the number of recordings audited so far. Document `triaxcal.audit/1`.
+
+[Many recordings](../how-to/audit-many-recordings.md): rows of `-o` are [stored as they come](many.md), and `--resume` goes on after any end. Fewer than 8 recordings are audited in this process, in the order given; more of them by a process on each core, where `pip install 'triaxcal[fleet]'` has brought Dask, and lines come as recordings are through. With `-o` only recordings that do not agree have lines. A recording for which memory or a worker ends has a row with exit code 5, and the others go on.""",  # noqa: E501
+    "batch poses": """[How to](../how-to/audit-many-recordings.md). [Columns](many.md#batch-poses). Recordings in a folder are `.mcap` (or the manifest of segments), `.csv`, `.csv.gz` and `.parquet`, but TABLE; tables of other names are named one by one. Nothing is on standard output but a line that counts. Processes, rows and `--resume` are as for `audit`. The worst exit code of all recordings counts, here and below.""",  # noqa: E501
+    "batch fit": """As [`fit`](#triaxcal-fit), each by itself. [Columns](many.md#batch-fit). Files of `--attitudes` and `--datasheet` go to the workers.""",  # noqa: E501
+    "batch diagnose": """As [`diagnose`](#triaxcal-diagnose), each by itself. [Columns](many.md#batch-diagnose).""",
+    "batch verify": """As [`verify`](#triaxcal-verify). [Columns](many.md#batch-verify).""",
+    "batch apply": """As [`apply`](#triaxcal-apply), to NAME.csv in FOLDER, which is made where it is not there; workers elsewhere must reach it by the same path. A file that was there before is left, and its recording has exit code 2; with `--resume` a file that TABLE tells of is replaced if its recording has changed. Two recordings of one name are an error (exit 2). [Columns](many.md#batch-apply).""",  # noqa: E501
     "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501
     "log export": """A phase or stream without samples is an error (exit 2). The output must not exist.""",
@@ -113,10 +120,19 @@ UNITS = """The columns of `--units`:
 
 def page() -> str:
     commands = dict(commands_of(parser()))
-    shared = _shared(commands.values())
+    of_command = {
+        name: {_key(a) for a in options(commands[name.removeprefix("batch ")])} for name in commands if _many(name)
+    }
+    shared = _shared([a for name, p in commands.items() for a in options(p) if _key(a) not in of_command.get(name, ())])
     tables = {o for g in commands["poses"]._action_groups if g.title == "tables" for o in names(g._group_actions)}
     head = HEAD + _table(list(shared.values()))
-    return "\n".join([head, *(_section(name, p, shared, tables) for name, p in commands.items())])
+    known = {name: {*shared, *of_command.get(name, ())} for name in commands}
+    return "\n".join([head, *(_section(name, p, known[name], tables) for name, p in commands.items())])
+
+
+def _many(name: str) -> bool:
+    """A command at many recordings has options of the command itself."""
+    return name.startswith("batch ")
 
 
 Key = tuple[tuple[str, ...], str | None, str]
@@ -127,9 +143,9 @@ def _key(a: argparse.Action) -> Key:
     return tuple(a.option_strings), a.help, _default(a)
 
 
-def _shared(commands: Iterable[argparse.ArgumentParser]) -> dict[Key, argparse.Action]:
+def _shared(every: Iterable[argparse.Action]) -> dict[Key, argparse.Action]:
     """The options that several commands have alike."""
-    every = [a for p in commands for a in options(p)]
+    every = list(every)
     count = Counter(map(_key, every))
     return {_key(a): a for a in every if count[_key(a)] > 1 and a.help}
 

@@ -8,8 +8,9 @@ import errno
 import os
 import re
 import stat
+from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol, Self, TypeAlias
 
 HEAD = 8192
 """Bytes that are looked at: a document begins with its format, and a TOML file
@@ -108,6 +109,23 @@ def document_kind(data: bytes) -> str | None:
     return found if found is not None and " of format " in found else None
 
 
+class StoredPath(Protocol):
+    """A file in a store that is no folder of this machine. It has the few methods of
+    `Path` that readers need, and opens itself. All raise OSError."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def parent(self) -> Self: ...
+    def with_name(self, name: str) -> Self: ...
+    def with_suffix(self, suffix: str) -> Self: ...
+    def glob(self, pattern: str) -> Iterable[Self]: ...
+    def open_binary(self) -> BinaryIO: ...
+
+
+AnyPath: TypeAlias = Path | StoredPath
+
+
 class TooLarge(OSError):
     """``head`` is what was read of a file of more than ``most`` bytes."""
 
@@ -116,13 +134,15 @@ class TooLarge(OSError):
         self.head = head
 
 
-def open_file(path: Path, *, pipe: bool = False) -> BinaryIO:
+def open_file(path: AnyPath, *, pipe: bool = False) -> BinaryIO:
     """A file to read from; with ``pipe`` also a pipe, where the user gave the
     name: `<(…)` of the shell is one.
 
     A device is not even opened, and a pipe that nobody writes to is empty
     instead of being waited for. Raises OSError with a reason to show.
     """
+    if not isinstance(path, Path):
+        return path.open_binary()
     try:
         _require_file(path.stat().st_mode, pipe)
         file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115 -- the caller closes it
@@ -148,7 +168,7 @@ def _require_file(mode: int, pipe: bool) -> None:
         raise OSError(errno.EINVAL, "a device or a pipe, expected a file")
 
 
-def read_whole(path: Path, most: int, *, pipe: bool = False) -> bytes:
+def read_whole(path: AnyPath, most: int, *, pipe: bool = False) -> bytes:
     """All of a file of at most ``most`` bytes. Raises OSError with a reason to
     show, TooLarge for a larger one."""
     with open_file(path, pipe=pipe) as file:

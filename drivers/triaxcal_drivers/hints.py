@@ -55,6 +55,11 @@ EXTRAS = {
     "httpx": "serve",
     "argon2": "serve",
     "psycopg": "postgres",
+    "dask": "fleet",
+    "distributed": "fleet",
+    "fsspec": "fleet",
+    "s3fs": "fleet",
+    "aiohttp": "fleet",
 }
 """Extra of each module, by import name."""
 CALLED = {"can": "python-can", "serial": "pyserial", "sse_starlette": "sse-starlette", "argon2": "argon2-cffi"}

@@ -6,6 +6,5 @@ nothing reads back.
 """
 
 from triaxcald.audit.conduct import Audit, audit
-from triaxcald.audit.many import Audited, audit_each, to_audit, worst
 
-__all__ = ["Audit", "Audited", "audit", "audit_each", "to_audit", "worst"]
+__all__ = ["Audit", "audit"]

@@ -35,7 +35,6 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.audit import text
-from triaxcald.audit.many import Audited
 from triaxcald.audit.wheels import Target, Wheels
 from triaxcald.computer import KEYS
 from triaxcald.errors import (
@@ -48,6 +47,7 @@ from triaxcald.errors import (
     exit_code_of,
     severest,
 )
+from triaxcald.many.sources import Unusable
 from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
 
@@ -303,7 +303,7 @@ class Part:
     error: str | None = None
 
 
-def grouped(asked: Iterable[Path]) -> tuple[dict[Software, list[Path]], list[Audited]]:
+def grouped(asked: Iterable[Path]) -> tuple[dict[Software, list[Path]], list[Unusable]]:
     """Recordings by the software that made them, and those that do not say it."""
     found: dict[Software, list[Path]] = {}
     failed = []
@@ -311,7 +311,7 @@ def grouped(asked: Iterable[Path]) -> tuple[dict[Software, list[Path]], list[Aud
         try:
             found.setdefault(made_with(path), []).append(path)
         except (DaemonError, td.DriverError) as e:
-            failed.append(Audited(str(path), None, str(e), exit_code_of(e)))
+            failed.append(Unusable(str(path), str(e), exit_code_of(e)))
     return found, failed
 
 
@@ -364,9 +364,9 @@ def _audited(python: Path, recordings: tuple[Path, ...], *, as_json: bool) -> Pa
     return Part(recordings, process.returncode, output or b"")
 
 
-def document_of(parts: Iterable[Part], failed: Iterable[Audited], order: Iterable[str]) -> dict[str, Any]:
+def document_of(parts: Iterable[Part], failed: Iterable[Unusable], order: Iterable[str]) -> dict[str, Any]:
     """One `triaxcal.audit/1` of several, its entries in the ``order`` of recordings."""
-    entries = {one.recording: text.document(one) for one in failed}
+    entries = {one.name: text.document(one.name, None, one.error) for one in failed}
     for part in parts:
         held, error = {}, part.error
         try:
@@ -374,7 +374,7 @@ def document_of(parts: Iterable[Part], failed: Iterable[Audited], order: Iterabl
         except (ValueError, LookupError, TypeError):
             error = f"the audit under the recorded versions ended with {part.exit_code} and without a document"
         for name in map(str, part.recordings):
-            entries[name] = held.get(name) or text.document(Audited(name, None, error or "not audited"))
+            entries[name] = held.get(name) or text.document(name, None, error or "not audited")
     audits = [entries[name] for name in dict.fromkeys(order) if name in entries]
     told = Counter("unreadable" if a["error"] else "differ" if a["differences"] else "agree" for a in audits)
     summary = {"recordings": len(audits), **{name: told[name] for name in ("agree", "differ", "unreadable")}}

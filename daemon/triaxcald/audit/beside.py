@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 
 import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
@@ -14,7 +13,7 @@ from triaxcald.recording.mcap_records import ATTACHMENT_LIMIT
 NAMES = (CERTIFICATE, REPORT, ATTACHMENT)
 
 
-def beside(path: Path, held: Mapping[str, bytes]) -> tuple[list[Difference], list[str]]:
+def beside(path: td.files.AnyPath, held: Mapping[str, bytes]) -> tuple[list[Difference], list[str]]:
     """Files that are otherwise than in the recording, and names of those that
     are not there."""
     differences, missing = [], []
@@ -32,7 +31,7 @@ def beside(path: Path, held: Mapping[str, bytes]) -> tuple[list[Difference], lis
     return differences, missing
 
 
-def outcomes_beside(path: Path) -> set[str]:
+def outcomes_beside(path: td.files.AnyPath) -> set[str]:
     """Digests of the outcomes in the recording's folder."""
     found = set()
     for file in path.parent.glob(f"*{SUFFIX}"):
@@ -41,6 +40,6 @@ def outcomes_beside(path: Path) -> set[str]:
     return found
 
 
-def _read(file: Path) -> bytes:
+def _read(file: td.files.AnyPath) -> bytes:
     with td.files.open_file(file) as stream:
         return stream.read(ATTACHMENT_LIMIT + 1)

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
+import triaxcal_drivers as td
 from triaxcald.audit import contents, previews
 from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
@@ -101,6 +101,9 @@ class Audit:
     in its standard error, and which."""
     within: Within | None = None
     """Of other software's figures, where it was asked for how far they may be off."""
+    serial: str | None = None
+    run: str | None = None
+    """Of the outcome, where it has them."""
 
     @property
     def result(self) -> Result:
@@ -111,7 +114,7 @@ class Audit:
         return Result.SAME_FIGURES if self.agreement.figures else Result.SAME_BYTES
 
 
-def audit(path: Path, *, compute: Compute = compute, within: float | None = None) -> Audit:
+def audit(path: td.files.AnyPath, *, compute: Compute = compute, within: float | None = None) -> Audit:
     """Raises RecordingError where the file cannot be read, or holds no result.
     ``compute`` makes the results again. ``within``: so much of its uncertainty a figure
     may be off that another version of triaxcal, numpy or scipy computed."""
@@ -133,7 +136,9 @@ COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
 
 
 class _Audit:
-    def __init__(self, path: Path, recording: Recording, compute: Compute, within: float | None = None) -> None:
+    def __init__(
+        self, path: td.files.AnyPath, recording: Recording, compute: Compute, within: float | None = None
+    ) -> None:
         self._path, self._recording, self._compute = path, recording, compute
         self._held = {name: recording.attachments[name] for name in recording.attachments if "/" not in name}
         self._checked: list[str] = []
@@ -164,19 +169,25 @@ class _Audit:
             self._differences += contents.against_inventory(found, self._outcome)
         differing, not_beside = beside(self._path, self._held)
         self._differences += differing
-        verdict = self._outcome.get("verdict")
         return Audit(
             str(self._path),
             tuple(dict.fromkeys(self._checked)),
             tuple(self._of_figure(d) for i, d in enumerate(self._differences) if d not in self._differences[:i]),
             self._notes(tuple(not_beside)),
-            verdict if isinstance(verdict, str) else None,
+            self._said("verdict"),
             self._agreement,
             self._computed_on(),
             self._made_by,
             self._furthest,
             self._within,
+            self._said("serial"),
+            self._said("run"),
         )
+
+    def _said(self, key: str) -> str | None:
+        """Of the outcome; None where it is no text."""
+        value = self._outcome.get(key)
+        return value if isinstance(value, str) else None
 
     def _of_figure(self, of: Difference) -> Difference:
         """With its share of the uncertainty, where that was asked for."""

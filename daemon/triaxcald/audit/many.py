@@ -1,83 +1,48 @@
-"""Many recordings, of which none hides another."""
+"""Audits of many recordings, of which none hides another: a row each."""
 
 from __future__ import annotations
 
-import glob
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from typing import Final
 
-import triaxcal as tc
 import triaxcal_drivers as td
+from triaxcald.audit import text
 from triaxcald.audit.conduct import Audit, audit
-from triaxcald.errors import DONE, OUTSIDE, SEVEREST, DaemonError, InputError, exit_code_of
-from triaxcald.memory import out_of_memory, ran_out_of_memory
+from triaxcald.errors import DONE, OUTSIDE
+from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding
+from triaxcald.many.sources import LIST
+from triaxcald.schema.columns import Kind
 
-_WILD = frozenset("*?[")
+ENDINGS: Final = (".mcap",)
+"""Ends of names of recordings in a folder."""
+MANIFESTS: Final = (*LIST, ".txt")
+"""Ends of names of manifests: no text is a recording that could be audited."""
 
-
-@dataclass(frozen=True)
-class Audited:
-    """A recording and its audit, or the ``error`` for which there is none."""
-
-    recording: str
-    audit: Audit | None
-    error: str | None = None
-    exit_code: int = DONE
-
-
-def to_audit(asked: Sequence[Path]) -> list[Path | Audited]:
-    """Recordings, folders of recordings, and patterns, in the order in which they are
-    given, each recording once. What names no recording is its own error."""
-    found: dict[Path | str, Path | Audited] = {}
-    for given in asked:
-        try:
-            found |= {path: path for path in _recordings_of(given) if path not in found}
-        except InputError as e:
-            found[str(given)] = Audited(str(given), None, str(e), exit_code_of(e))
-    return list(found.values())
-
-
-def audit_each(
-    of: Iterable[Path | Audited], begins: Callable[[Path], None] = lambda path: None, *, within: float | None = None
-) -> Iterator[Audited]:
-    """Audit what `to_audit` found; ``begins`` is called before each recording.
-    ``within`` as in `audit`."""
-    for one in of:
-        if isinstance(one, Audited):
-            yield one
-        else:
-            begins(one)
-            yield _audited(one, within)
+COLUMNS: Final[tuple[Column[Audit], ...]] = (
+    *COMMON_BEFORE,
+    Column("result", Kind.TEXT, "`same_bytes`, `same_figures`, `within` or `differs`", lambda a: a.result.value),
+    Column("verdict", Kind.TEXT, "[verdict](outcome.md#verdict-and-code) of the run", lambda a: a.verdict),
+    Column("serial", Kind.TEXT, "serial number of the unit", lambda a: a.serial),
+    Column("run", Kind.TEXT, "id of the run", lambda a: a.run),
+    Column("made_by", Kind.TEXT, "version that made the recording, if it is another one", lambda a: a.made_by),
+    Column("differences", Kind.WHOLE, "number of differences", lambda a: len(a.differences)),
+    Column(
+        "first_difference", Kind.TEXT, "the first of them",
+        lambda a: text.difference(a.differences[0]) if a.differences else None,
+    ),
+    Column(
+        "of_uncertainty", Kind.NUMBER, "of `same_figures`: the largest difference of a figure in its uncertainty",
+        lambda a: a.agreement.of_uncertainty if a.agreement.figures else None,
+    ),
+    *COMMON_AFTER,
+)  # fmt: skip
 
 
-def worst(of: Iterable[Audited]) -> int:
-    codes = {a.exit_code for a in of}
-    return next((code for code in SEVEREST if code in codes), DONE)
-
-
-def _audited(path: Path, within: float | None) -> Audited:
-    try:
-        found = audit(path, within=within)
-    except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
-        return Audited(str(path), None, str(e), exit_code_of(e))
-    except Exception as e:
-        if not ran_out_of_memory(e):
-            raise
-        return Audited(str(path), None, f"{path}: {out_of_memory(e)}", exit_code_of(e))
-    return Audited(str(path), found, exit_code=OUTSIDE if found.differences else DONE)
-
-
-def _recordings_of(given: Path) -> list[Path]:
-    """Raises InputError where there is none."""
-    if given.is_dir():
-        found = sorted(path for path in given.rglob("*.mcap") if not path.is_dir())
-        if not found:
-            raise InputError(f"{given}: Is a directory, without a recording (.mcap) in it")
-        return found
-    if not given.exists() and _WILD & set(str(given)):
-        found = sorted(map(Path, glob.glob(str(given), recursive=True)))
-        if not found:
-            raise InputError(f"{given}: no file has a name like this")
-        return [path for of in found for path in (_recordings_of(of) if of.is_dir() else [of])]
-    return [given]
+def audited(path: td.files.AnyPath, *, within: float | None = None) -> Finding:
+    """Raises what `audit` does; ``within`` as there."""
+    found = audit(path, within=within)
+    return Finding(
+        {column.name: column.value(found) for column in COLUMNS if column not in (*COMMON_BEFORE, *COMMON_AFTER)},
+        OUTSIDE if found.differences else DONE,
+        tuple(text.lines(found)),
+        text.document(str(path), found),
+    )

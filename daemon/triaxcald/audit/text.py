@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from math import ceil, floor, log10
 from typing import Any
 
@@ -12,7 +12,6 @@ import triaxcal as tc
 from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
 from triaxcald.audit.figures import SHARE, Agreement
-from triaxcald.audit.many import Audited
 from triaxcald.audit.within import Moved, Within
 
 _LONGEST = 60
@@ -182,43 +181,54 @@ def _where(of: Audit) -> str:
     return f"computed on {'the same' if dict(then) == dict(now) else 'another'} processor"
 
 
-def summary(of: Sequence[Audited]) -> str:
-    """ "12 recordings: 10 agree, 1 differs, 1 could not be audited"."""
-    return f"{tc.number_format.number_of(len(of), 'recording')}: {_told(of)}"
+def lines(of: Audit) -> list[str]:
+    """All that there is to say of one audit."""
+    return [heading(of), *(f"  {difference(d)}" for d in of.differences), *(f"  note: {n}" for n in notes(of.notes))]
 
 
-def stopped(of: Sequence[Audited], total: int) -> str:
+AGREE, DIFFER, UNREADABLE = "agree", "differ", "unreadable"
+
+
+def outcome_of(result: object) -> str:
+    """How a recording counts, by its ``result``; None where it could not be audited."""
+    return UNREADABLE if result is None else DIFFER if result == Result.DIFFERS.value else AGREE
+
+
+def summary(of: Counter[str]) -> str:
+    """ "12 recordings: 10 agree, 1 differs, 1 could not be audited", of how many count
+    as what."""
+    return f"{tc.number_format.number_of(of.total(), 'recording')}: {_told(of)}"
+
+
+def stopped(of: Counter[str], total: int) -> str:
     """ "12 of 40 recordings audited: 11 agree, 1 differs"."""
     told = f": {_told(of)}" if of else ""
-    return f"{len(of)} of {tc.number_format.number_of(total, 'recording')} audited{told}"
+    return f"{of.total()} of {tc.number_format.number_of(total, 'recording')} audited{told}"
 
 
-def _told(of: Sequence[Audited]) -> str:
-    counts = _counted(of)
-    told = [f"{counts['agree']} agree{'s' if counts['agree'] == 1 else ''}"]
-    if counts["differ"]:
-        told.append(f"{counts['differ']} differ{'s' if counts['differ'] == 1 else ''}")
-    if counts["unreadable"]:
-        told.append(f"{counts['unreadable']} could not be audited")
+def _told(counts: Counter[str]) -> str:
+    told = [f"{counts[AGREE]} agree{'s' if counts[AGREE] == 1 else ''}"]
+    if counts[DIFFER]:
+        told.append(f"{counts[DIFFER]} differ{'s' if counts[DIFFER] == 1 else ''}")
+    if counts[UNREADABLE]:
+        told.append(f"{counts[UNREADABLE]} could not be audited")
     return ", ".join(told)
 
 
-def counts(of: Sequence[Audited]) -> dict[str, int]:
+def counts(of: Counter[str]) -> dict[str, int]:
     """The same as numbers, for the document."""
-    found = _counted(of)
-    return {"recordings": len(of), **{name: found[name] for name in ("agree", "differ", "unreadable")}}
+    return {"recordings": of.total(), **{name: of[name] for name in (AGREE, DIFFER, UNREADABLE)}}
 
 
-def document(of: Audited) -> dict[str, Any]:
+def document(recording: str, found: Audit | None, error: str | None = None) -> dict[str, Any]:
     """An entry of `triaxcal.audit/1`."""
-    found = of.audit
     return {
-        "recording": of.recording,
+        "recording": recording,
         "checked": list(found.checked) if found else [],
         "differences": [difference(d) for d in found.differences] if found else [],
         "notes": notes(found.notes) if found else [],
         "verdict": found.verdict if found else None,
-        "error": of.error,
+        "error": error,
         "result": found.result.value if found else None,
         "largest_difference": _agreement(found.agreement) if found else None,
         "computer": dict(zip(("then", "now"), map(dict, found.computed_on), strict=True)) if found else None,
@@ -247,6 +257,29 @@ def _moved(of: Moved) -> dict[str, Any]:
     }
 
 
+def document_of_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The same of a row that an earlier run has stored, which keeps the first
+    difference alone."""
+    first = row.get("first_difference")
+    known = {key: row.get(key) for key in ("recording", "verdict", "error", "result")}
+    return {**document("", None), **known, "differences": [] if first is None else [first]}
+
+
+def lines_of_row(row: Mapping[str, Any]) -> list[str]:
+    """Of a row that an earlier run has stored; none where there is an error."""
+    if row.get("error") is not None:
+        return []
+    count, first = row.get("differences") or 0, row.get("first_difference")
+    more = f" (and {count - 1} more)" if count > 1 else ""
+    said = {
+        Result.SAME_BYTES: "the same, byte for byte",
+        Result.SAME_FIGURES: "the same figures",
+        Result.WITHIN: "within the share of the uncertainties that was asked for",
+    }
+    head = f"{row['recording']}: {said.get(Result(row['result']), 'differs')}; verdict {row.get('verdict')}"
+    return [head, *([] if first is None else [f"  {first}{more}"])]
+
+
 def _agreement(of: Agreement) -> dict[str, Any] | None:
     """How far figures are off that are the same; None where all have the same
     bytes."""
@@ -258,7 +291,3 @@ def _agreement(of: Agreement) -> dict[str, Any] | None:
         "relative": of.relative,
         "place": of.worst or None,
     }
-
-
-def _counted(of: Sequence[Audited]) -> Counter[str]:
-    return Counter("unreadable" if a.audit is None else "differ" if a.audit.differences else "agree" for a in of)

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import triaxcal_drivers as td
+from triaxcald.cli.many_syntax import register_many
 from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
 
@@ -25,7 +26,9 @@ loaded. Figures must not depend on how many threads a computer has."""
 def parser() -> OneLineParser:
     top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
     top.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-    register(top.add_subparsers(dest="command", required=True, metavar="COMMAND"))
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    register(commands)
+    register_many(commands)
     return top
 
 

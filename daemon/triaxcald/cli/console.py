@@ -102,9 +102,24 @@ def telling_progress() -> Iterator[None]:
         _line = None
 
 
+_silent = False
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Within it `say` and `at` say nothing: at one of many recordings, whose row has
+    what there is to say."""
+    global _silent
+    before, _silent = _silent, True
+    try:
+        yield
+    finally:
+        _silent = before
+
+
 def at(what: str, done: float | None = None) -> None:
     """Show the present step of the command."""
-    if _line is not None:
+    if _line is not None and not _silent:
         _line.at(what, done)
 
 
@@ -168,6 +183,8 @@ def say(text: str) -> None:
     What a file holds may be quoted in it: that can neither begin a second line
     nor steer the terminal.
     """
+    if _silent:
+        return
     erased()
     line = printable(text)
     if len(line) > LINE_MOST:

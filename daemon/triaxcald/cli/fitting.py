@@ -481,6 +481,18 @@ def fit_command(a: argparse.Namespace) -> int:
     way = chosen_way(a)
     if way is not None:
         return _fit_by(way, a)
+    measured, document, calibration, show_it = still_poses(a)
+    write_results(a, measured, document)
+    if a.json:
+        emit(document)
+    else:
+        show_it()
+        warn([*map(tc.text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
+    return judge(a.limit, calibration.residual.rms_g, calibration.reference)
+
+
+def still_poses(a: argparse.Namespace) -> Way:
+    """The linear model of the still poses. Raises Refused."""
     measured = read_recording(a, a.recording)
     settings = fit_settings(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
@@ -490,13 +502,7 @@ def fit_command(a: argparse.Namespace) -> int:
         calibration, output_unit=settings.output_unit, reference_unit=settings.reference_unit, stated=settings.stated
     )
     document["data_quality"] = measured.data_quality
-    write_results(a, measured, document)
-    if a.json:
-        emit(document)
-    else:
-        show_calibration(calibration, settings)
-        warn([*map(tc.text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
-    return judge(a.limit, calibration.residual.rms_g, calibration.reference)
+    return measured, document, calibration, lambda: show_calibration(calibration, settings)
 
 
 def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> int:
@@ -547,6 +553,14 @@ def diagnose_command(a: argparse.Namespace) -> int:
             show(text_of_held_out(loop.held_out, settings.small))
         warn([*document["calibration"]["warnings"], *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, loop.after.residual.rms_g, loop.after.reference)
+
+
+def diagnosed(a: argparse.Namespace) -> tuple[Measured, tc.diagnosis.Loop, tc.interchange.Document]:
+    """One recording by itself, and its `triaxcal.loop/1`. Raises Refused."""
+    measured = read_recording(a, a.recording)
+    settings = fit_settings(a, measured)
+    loop = _loop(a, measured, settings)
+    return measured, loop, _loop_document(loop, measured, settings)
 
 
 def _loop(

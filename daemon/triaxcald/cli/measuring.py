@@ -6,8 +6,10 @@ import argparse
 import gzip
 import io
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +26,18 @@ from triaxcald.tables.native_csv import write_csv
 from triaxcald.verification import Verification, errors_under, pose_rows, trust, unlike
 
 
-def poses(a: argparse.Namespace) -> int:
+def found_poses(a: argparse.Namespace) -> tuple[Measured, tc.interchange.Document]:
+    """The still poses of a recording, and its `triaxcal.poses/1`."""
     measured = read_recording(a, a.recording)
     document = tc.interchange.poses_document(measured.poses)
     for row, p in zip(document["poses"], measured.poses, strict=True):
         row |= trust(p)
     document["data_quality"] = measured.data_quality
+    return measured, document
+
+
+def poses(a: argparse.Namespace) -> int:
+    measured, document = found_poses(a)
     if a.json:
         emit(document)
         return 0
@@ -53,8 +61,20 @@ def poses(a: argparse.Namespace) -> int:
     return 0
 
 
-def verify_command(a: argparse.Namespace) -> int:
-    document = read_document(a.calibration)
+@dataclass(frozen=True)
+class Verified:
+    """``result`` is the `triaxcal.verify/1`, ``expected_g`` the rms error to expect."""
+
+    measured: Measured
+    found: Verification
+    calibration: tc.Calibration
+    expected_g: float
+    result: dict[str, Any]
+
+
+def verified_by(a: argparse.Namespace, document: Mapping[str, Any]) -> Verified:
+    """The poses of a recording under the calibration in a ``document``, whose name is
+    ``a.calibration``. Raises InputError, Refused."""
     calibration = tc.Calibration.from_dict(document, where=a.calibration)
     model = calibration.fitted
     sensor, reference = model.sensor, model.reference
@@ -88,16 +108,25 @@ def verify_command(a: argparse.Namespace) -> int:
         "data_quality": measured.data_quality,
         "warnings": warnings,
     }
+    return Verified(measured, found, calibration, expected, result)
+
+
+def verify_command(a: argparse.Namespace) -> int:
+    document = read_document(a.calibration)
+    of = verified_by(a, document)
+    found, reference = of.found, of.calibration.fitted.reference
+    assert found.rms_g is not None
+    assert found.noise_floor_g is not None
     unit = a.reference_unit or tc.interchange.reference_unit_in(document, where=a.calibration, magnitude=reference)
     if a.json:
-        emit(result)
+        emit(of.result)
     else:
         _show_verified(
             found, f"|a| − {reference:g} {unit} under {a.calibration}", tc.units.ErrorUnit.of(unit, reference)
         )
         poses = counted(len(found.poses), len(found.untrusted))
-        show(tc.text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
-        warn([*warnings, *measured.data_quality])
+        show(tc.text.verification(poses, found.rms_g, found.noise_floor_g, of.expected_g, (unit, reference)))
+        warn([*of.result["warnings"], *of.measured.data_quality])
     return judge(a.limit, found.rms_g, reference)
 
 
@@ -164,22 +193,13 @@ def apply_command(a: argparse.Namespace) -> int:
     if not a.output.name.endswith(KINDS):
         raise InputError(f"{a.output}: expected a name that ends in {', '.join(KINDS)}")
     writable(a.output)
-    if a.own_recording and a.phase != CALIBRATION:
-        raise InputError(f"--own-recording: the {a.phase} phase has no times of the recording that was fitted")
+    require_own_times(a)
     calibration = tc.Calibration.from_dict(read_document(a.calibration), where=a.calibration)
-    found = applied(
-        calibration,
-        a.recording,
-        uncertainty=a.uncertainty,
-        own_recording=a.own_recording,
-        phase=a.phase,
-        reading=reading_of(a, a.recording, calibration),
-        output_unit=a.output_unit or "",
-    )
+    found = applied_as(a, calibration)
     for remark in found.remarks:
         say(f"{a.recording}: {remark}")
     with new_beside(a.output) as path:
-        samples = _written(found, path, a.output.name)
+        samples = written(found, path, a.output.name)
     if not a.own_recording:
         own = f"if {a.recording} is that recording, --own-recording takes the time of each reading"
         found.cautions += [f"{line}; {own}" for line in _of_its_times(calibration.fitted, a.calibration)]
@@ -189,7 +209,26 @@ def apply_command(a: argparse.Namespace) -> int:
     return 0
 
 
-def _written(found: Applied, path: Path, name: str) -> int:
+def require_own_times(a: argparse.Namespace) -> None:
+    """Raises InputError."""
+    if a.own_recording and a.phase != CALIBRATION:
+        raise InputError(f"--own-recording: the {a.phase} phase has no times of the recording that was fitted")
+
+
+def applied_as(a: argparse.Namespace, calibration: tc.Calibration) -> Applied:
+    """The recording under the calibration, as the options say."""
+    return applied(
+        calibration,
+        a.recording,
+        uncertainty=a.uncertainty,
+        own_recording=a.own_recording,
+        phase=a.phase,
+        reading=reading_of(a, a.recording, calibration),
+        output_unit=a.output_unit or "",
+    )
+
+
+def written(found: Applied, path: Path, name: str) -> int:
     if name.endswith(".parquet"):
         return write_parquet(path, found.blocks, found.start_ns)
     with path.open("wb") as file:

@@ -1,4 +1,4 @@
-"""audit, log."""
+"""log."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import argparse
 import dataclasses
 import io
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.abort import AbortNotice, at_abort
-from triaxcald.cli.console import at, emit, say, show
+from triaxcald.cli.console import emit, say, show
 from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
 from triaxcald.errors import InputError
@@ -27,71 +26,6 @@ from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Contents, open_recording
 from triaxcald.recording.recover import recover
 from triaxcald.tables.native_csv import Rows, write_csv
-
-if TYPE_CHECKING:
-    from triaxcald.audit import Audited
-
-
-def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import audit_each, text, to_audit, worst  # the whole line, which no `log` needs
-
-    _require_agreeing(a)
-    asked = to_audit(a.recordings)
-    if a.as_made:
-        return _audit_as_made(a, asked)
-    audited: list[Audited] = []
-    with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
-        for one in audit_each(asked, lambda path: at(f"auditing {path}"), within=a.within):
-            audited.append(one)
-            if one.audit is None:
-                say(f"triaxcal: {one.error}")
-            elif not a.json:
-                show(text.heading(one.audit))
-                for line in map(text.difference, one.audit.differences):
-                    show(f"  {line}")
-                for line in text.notes(one.audit.notes):
-                    show(f"  note: {line}")
-                sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
-    if a.json:
-        emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
-              "summary": text.counts(audited)})  # fmt: skip
-    elif len(audited) > 1:
-        show(text.summary(audited))
-    return worst(audited)
-
-
-def _audit_as_made(a: argparse.Namespace, asked: Sequence[Path | Audited]) -> int:
-    from triaxcald.audit import Audited, as_made
-    from triaxcald.audit.wheels import Wheels
-
-    wheels = Wheels.of(a.wheels)
-    paths = [one for one in asked if not isinstance(one, Audited)]
-    found, failed = as_made.grouped(paths)
-    failed = [*(one for one in asked if isinstance(one, Audited)), *failed]
-    for one in failed:
-        say(f"triaxcal: {one.error}")
-    parts: list[as_made.Part] = []
-    for software, recordings in found.items():
-        for part in as_made.audit_as_made(software, recordings, wheels, as_json=a.json, begins=at, notes=say):
-            parts.append(part)
-            if part.error is not None:
-                say(f"triaxcal: {part.error}")
-    if a.json and len(parts) == 1 and parts[0].output and not failed:
-        sys.stdout.write(parts[0].output.decode(errors="replace"))
-    elif a.json:
-        order = [one.recording if isinstance(one, Audited) else str(one) for one in asked]
-        emit(as_made.document_of(parts, failed, order))
-    return as_made.worst_of([part.exit_code for part in parts] + [one.exit_code for one in failed])
-
-
-def _require_agreeing(a: argparse.Namespace) -> None:
-    """Raises InputError where options do not go together."""
-    if a.as_made and a.wheels is None:
-        raise InputError("--as-made: needs --wheels FOLDER, with the wheels of the versions that made the recordings")
-    if a.wheels is not None and not a.as_made:
-        raise InputError("--wheels: only --as-made installs something")
-    if a.as_made and a.within is not None:
-        raise InputError("--within: under the versions that made it nothing may be off; leave out --as-made")
 
 
 def info_command(a: argparse.Namespace) -> int:

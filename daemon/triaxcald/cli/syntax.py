@@ -181,6 +181,13 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
         recording.nargs, recording.required = "?", False
     if several:
         recording.nargs = "+"
+    add_measuring(parser)
+    add_json(parser)
+    add_table(parser)
+
+
+def add_measuring(parser: argparse.ArgumentParser) -> None:
+    """What the readings are and what they measure."""
     parser.add_argument("--sign", type=signs, metavar="S,S,S", help="signs of the scale factors; write --sign=-,-,-")
     parser.add_argument("--output-unit", metavar="UNIT", help="unit of the readings, for the documents")
     parser.add_argument(
@@ -190,8 +197,6 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
         help="magnitude of the reference vector in its own unit; default: the recording's, else 1 g",
     )
     parser.add_argument("--reference-unit", metavar="UNIT", help="that unit, for the documents")
-    add_json(parser)
-    add_table(parser)
 
 
 def add_table(parser: argparse.ArgumentParser) -> None:
@@ -287,10 +292,10 @@ def register(commands: Any) -> None:
     _planning(commands)
     _devices(commands)
     _access(commands)
-    _audits(commands)
+    _logs(commands)
 
 
-def _command(
+def add_command(
     commands: Any, name: str, run: str, help_line: str, more: str = "", example: str = "", *, computes: bool = False
 ) -> Any:
     """``more`` follows the line in the command's own help, and the ``example``
@@ -308,7 +313,7 @@ def _command(
 
 
 def _line(commands: Any) -> None:
-    p = _command(
+    p = add_command(
         commands, "demo", "stations:demo_command", "the whole line on two simulated units, in about a minute",
         "A CAN and a Modbus unit with hidden effects are recorded, calibrated, written, power-cycled and verified.",
         "demo --out demo-out",
@@ -322,7 +327,7 @@ def _line(commands: Any) -> None:
     )
     p.add_argument("--port", type=port, default=8484, help="of the page; default: 8484")
     add_json(p)
-    p = _command(
+    p = add_command(
         commands, "run", "stations:run_command", "the whole line on the devices of a station file",
         "Guides the operator from pose to pose; records, calibrates, writes the registers and verifies them.",
         "run station.toml",
@@ -338,7 +343,7 @@ def _line(commands: Any) -> None:
     p.add_argument(
         "--events", action="store_true", help="one JSON object a line on standard output, as the work goes on"
     )
-    p = _command(
+    p = add_command(
         commands, "serve", "serve:serve_command", "the service and the page of a station",
         "People scan, turn and see PASS or FAIL in a browser; programs use the interface under /api/1. Runs, units and "
         "figures are in triaxcal.sqlite in the station's folder, or in PostgreSQL.",
@@ -351,7 +356,7 @@ def _line(commands: Any) -> None:
     p.add_argument("--cert", metavar="FILE", type=Path, help="certificate (PEM), needed beyond this machine")
     p.add_argument("--key", metavar="FILE", type=Path, help="its key (PEM)")
     p.add_argument("--backup", metavar="FILE", type=Path, help="copy the database, also of a service at work, and end")
-    p = _command(
+    p = add_command(
         commands, "sim", "stations:sim_command", "serve simulated units on their buses until stopped",
         "Several units are on one fixture, with one clock. It turns by itself; with --follow an operator turns it, who "
         "does what a run says: after the reaction_s of a device file's [fixture], 1 s by default, and in 1 of 50 turns "
@@ -364,7 +369,7 @@ def _line(commands: Any) -> None:
         help="turn the units and switch their supplies as the events of `run --events` say, from a file that grows, a "
         "FIFO, standard input, or a station's service (http://…)",
     )  # fmt: skip
-    p = _command(
+    p = add_command(
         commands, "record", "record:record_command", "record only",
         "A unit that is absent or lost is waited for; the gap is in the recording. A bus of the station is recorded "
         "with all its frames, for `log import`.",
@@ -394,7 +399,7 @@ def _line(commands: Any) -> None:
         "--metrics", type=port, metavar="PORT", help="numbers for Prometheus and a health page on the loopback"
     )
     p.add_argument("--log-format", choices=("text", "json"), default="text", help="of progress; json: an object a line")
-    p = _command(
+    p = add_command(
         commands, "results", "results:results_command", "one row for each run in a station's folder",
         "Shows the runs, or writes them with all their columns to a table.",
         "results out --since 2026-01-01 -o runs.csv",
@@ -460,23 +465,23 @@ def _slot_serial(text: str) -> tuple[str, str]:
 
 
 def _on_recordings(commands: Any) -> None:
-    p = _command(
+    p = add_command(
         commands, "poses", "measuring:poses", "find the still spans of a recording",
         "Means and standard errors are in the output's unit, times in seconds from the first sample. No threshold is "
         "set: the noise is learned from the recording.", "poses rec.csv",
         computes=True,
     )  # fmt: skip
     add_recording(p)
-    p = _command(
+    p = add_command(
         commands, "fit", "fitting:fit_command", "fit the linear model to a recording's still poses",
         "Scale factors, misalignments [rad] and biases [g] with their standard errors; at least 9 poses, better 14.",
         "fit rec.csv --sign=-,-,- -o cal.json --report fit.html",
         computes=True,
     )  # fmt: skip
     add_recording(p)
-    _add_ways(p)
+    add_ways(p)
     _add_results(p)
-    p = _command(
+    p = add_command(
         commands, "diagnose", "fitting:diagnose_command", "find, add and judge effects that the linear model lacks",
         "Nonlinearity, temperature, drift, hysteresis and more, with the error of the magnitude [g] before and after.",
         "diagnose rec.csv --check other.csv -o cal.json --report loop.html",
@@ -488,12 +493,9 @@ def _on_recordings(commands: Any) -> None:
         "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
     )
     p.add_argument("--verbose", action="store_true", help="tables too: errors, probabilities, coefficients, budget")
-    p.add_argument(
-        "--at", type=moment, metavar="end|mean|SECONDS",
-        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
-    )  # fmt: skip
+    add_moment(p)
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
-    p = _command(
+    p = add_command(
         commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",
         "Scale factors, misalignments and effects are kept; three distinct poses are needed, four are better.",
         "rezero cal.json rec.csv --poses 4 -o cal2.json",
@@ -503,7 +505,7 @@ def _on_recordings(commands: Any) -> None:
     add_recording(p)
     p.add_argument("--poses", type=count, metavar="N", help="the first N distinct poses; default: all")
     _add_files(p)
-    p = _command(
+    p = add_command(
         commands, "apply", "measuring:apply_command", "calibrated readings of a recording",
         "Writes its samples with ax, ay, az behind them, in the unit of the reference vector (g, unless the "
         "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
@@ -512,15 +514,9 @@ def _on_recordings(commands: Any) -> None:
     p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
     p.add_argument("recording", metavar="REC", help=RECORDING)
     p.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help=".csv, .csv.gz or .parquet")
-    p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
-    p.add_argument(
-        "--own-recording", action="store_true",
-        help="REC is the recording that was calibrated: effects of time at each of its times",
-    )  # fmt: skip
-    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
-    p.add_argument("--output-unit", metavar="UNIT", help="unit of REC's outputs, whatever its header says")
+    add_applying(p)
     add_table(p)
-    p = _command(
+    p = add_command(
         commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",
         "Errors are |a| less the reference, in its unit, with the standard error that noise gives each.",
         "verify cal.json rec.csv --limit 2e-4",
@@ -528,11 +524,32 @@ def _on_recordings(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL.json")
     add_recording(p)
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this, in g")
+    add_error_limit(p)
     _frame(commands)
 
 
-def _add_ways(parser: argparse.ArgumentParser) -> None:
+def add_moment(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--at", type=moment, metavar="end|mean|SECONDS",
+        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
+    )  # fmt: skip
+
+
+def add_applying(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
+    p.add_argument(
+        "--own-recording", action="store_true",
+        help="REC is the recording that was calibrated: effects of time at each of its times",
+    )  # fmt: skip
+    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
+    p.add_argument("--output-unit", metavar="UNIT", help="unit of REC's outputs, whatever its header says")
+
+
+def add_error_limit(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this, in g")
+
+
+def add_ways(parser: argparse.ArgumentParser) -> None:
     ways = parser.add_mutually_exclusive_group()
     ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
     ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
@@ -571,11 +588,15 @@ def _add_results(p: argparse.ArgumentParser) -> None:
 def _add_files(p: argparse.ArgumentParser) -> None:
     p.add_argument("-o", "--output", type=Path, metavar="CAL.json", help="the document; not a file that is read")
     p.add_argument("--report", type=Path, metavar="R.html", help="the same for people, in one file")
+    add_residual_limit(p)
+
+
+def add_residual_limit(p: argparse.ArgumentParser) -> None:
     p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this, in g")
 
 
 def _frame(commands: Any) -> None:
-    p = _command(
+    p = add_command(
         commands, "frame", "framing:frame_command", "units on one fixture in the frame of its faces",
         "Rotations from each sensor's frame to the fixture's, in rad.", "frame left.csv right.csv --datum=-Z,-X",
         computes=True,
@@ -638,7 +659,7 @@ def _angle(text: str) -> float:
 
 
 def _planning(commands: Any) -> None:
-    p = _command(
+    p = add_command(
         commands, "plan", "planning:plan_command", "a pose plan, and what it can and cannot see",
         "With a recording: the poses that are still worth adding to it.", "plan --poses 26",
         computes=True,
@@ -651,7 +672,7 @@ def _planning(commands: Any) -> None:
 
 
 def _devices(commands: Any) -> None:
-    p = _command(
+    p = add_command(
         commands, "provision", "provisioning:provision_command",
         "write a calibration to the device's registers and verify it",
         "Unlocks, writes what differs, stores, restarts and reads back; what the device holds is said at every way "
@@ -665,7 +686,7 @@ def _devices(commands: Any) -> None:
     _add_power_cycle(p)
     add_force(p)
     add_json(p)
-    p = _command(
+    p = add_command(
         commands, "restore", "provisioning:restore_command",
         "put the registers back that a recording or a journal has kept", "", "restore rec.mcap station.toml",
     )  # fmt: skip
@@ -674,20 +695,20 @@ def _devices(commands: Any) -> None:
     p.add_argument("--unit", help="where the station has more than one; by default the one of that name in the source")
     _add_power_cycle(p)
     add_json(p)
-    p = _command(
+    p = add_command(
         commands, "registers", "devices:registers_command", "read and explain the device's calibration registers",
         "", "registers station.toml",
     )  # fmt: skip
     p.add_argument("station", metavar="STATION.toml", type=Path)
     p.add_argument("--unit", help="where the station has more than one")
     add_json(p)
-    p = _command(
+    p = add_command(
         commands, "devices", "devices:devices_command",
         "drivers, profiles and effects found, broken ones with their reason",
     )  # fmt: skip
     add_json(p)
     parts = p.add_subparsers(dest="part", metavar="[check|new]")
-    p = _command(
+    p = add_command(
         parts, "check", "profiles:check_command", "show what resolves of a profile, and what a log holds by it",
         "LOG is one that log import takes, or a recording of a unit. Exit 1 if there are problems.",
         "devices check imu.toml drive.blf",
@@ -696,7 +717,7 @@ def _devices(commands: Any) -> None:
     p.add_argument("log", metavar="LOG", type=Path, nargs="?")
     _add_selection(p)
     add_json(p)
-    p = _command(
+    p = add_command(
         parts, "new", "profiles:new_command", "print a commented profile to begin with",
         "", "devices new can-dbc > my-device.toml",
     )  # fmt: skip
@@ -738,7 +759,7 @@ def _access(commands: Any) -> None:
         ("enable", "let a disabled person sign in again", ""),
     ):
         example = {"list": "people list", "role": "people role Ada engineer", "add": "people add Ada --role operator"}
-        p = _command(
+        p = add_command(
             parts, part, f"people:people_{part}", help_line, more,
             f"{example.get(part, f'people {part} Ada')} --station station.toml",
         )  # fmt: skip
@@ -756,7 +777,7 @@ def _access(commands: Any) -> None:
         _add_database(p)
     token = commands.add_parser("token", help="which programs may use a station's service")
     parts = token.add_subparsers(dest="part", required=True, metavar="new|list|revoke")
-    p = _command(
+    p = add_command(
         parts, "new", "people:token_new", "make a token for a program",
         "The token alone is on standard output; it is shown this once.",
         "token new mes --role operator --station station.toml",
@@ -764,11 +785,11 @@ def _access(commands: Any) -> None:
     p.add_argument("name", metavar="NAME", help="of the program, 1 to 64 printable characters")
     p.add_argument("--role", choices=ROLES, required=True, help="each may do what those before it may")
     _add_database(p)
-    p = _command(
+    p = add_command(
         parts, "list", "people:token_list", "show the tokens by their names", "", "token list --station station.toml"
     )
     _add_database(p)
-    p = _command(
+    p = add_command(
         parts, "revoke", "people:token_revoke", "refuse a token from now on", "",
         "token revoke mes --station station.toml",
     )  # fmt: skip
@@ -784,35 +805,29 @@ def _add_database(p: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _audits(commands: Any) -> None:
-    p = _command(
-        commands, "audit", "recordings:audit_command", "recompute results from recordings and compare",
-        "A summary follows several; one unreadable file hides no other.", "audit recordings/",
-        computes=True,
-    )  # fmt: skip
-    p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
-    _add_other_versions(p)
-    add_json(p)
+def _logs(commands: Any) -> None:
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
     parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
-    p = _command(parts, "info", "recordings:info_command", "show the contents of a recording", "", "log info rec.mcap")
+    p = add_command(
+        parts, "info", "recordings:info_command", "show the contents of a recording", "", "log info rec.mcap"
+    )
     p.add_argument("recording", metavar="REC", type=Path)
     add_json(p)
-    p = _command(
+    p = add_command(
         parts, "recover", "recordings:recover_command", "mend a recording that was cut short, and say what was lost",
         "", "log recover rec.mcap",
     )  # fmt: skip
     p.add_argument("recording", metavar="REC", type=Path)
     p.add_argument("-o", "--output", type=Path, help="default: REC with .recovered before .mcap")
     add_json(p)
-    p = _command(
+    p = add_command(
         parts, "export", "recordings:export_command", "write the samples as CSV", "", "log export rec.mcap -o rec.csv"
     )
     p.add_argument("recording", metavar="REC", type=Path)
     p.add_argument("-o", "--output", type=Path, help="default: standard output")
     p.add_argument("--stream", default=READINGS, help="or corrected: the device's own output, in g")
     p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="verification: the check poses after writing")
-    p = _command(
+    p = add_command(
         parts, "import", "recordings:import_command", "make a recording of a log that others recorded",
         "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, or MCAP with messages of ROS 2, JSON or protobuf, "
         "told by the file's first bytes; packed with gzip or not.",
@@ -823,16 +838,3 @@ def _audits(commands: Any) -> None:
     p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
     _add_selection(p)
     add_json(p)
-
-
-def _add_other_versions(p: argparse.ArgumentParser) -> None:
-    """Of an audit: recordings that other versions made."""
-    p.add_argument(
-        "--within", metavar="X", type=positive,
-        help="figures of another triaxcal, numpy or scipy may be off by so much of their uncertainty, as 0.01",
-    )  # fmt: skip
-    p.add_argument(
-        "--as-made", action="store_true",
-        help="audit under the versions that made the recording, in an environment built of --wheels",
-    )  # fmt: skip
-    p.add_argument("--wheels", metavar="FOLDER", type=Path, help="with wheels of these versions; nothing is downloaded")

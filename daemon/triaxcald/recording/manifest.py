@@ -115,7 +115,7 @@ def manifest_path(path: Path) -> Path:
     return path if is_manifest(path) else path.with_name(path.name.removesuffix(".mcap") + SUFFIX)
 
 
-def is_manifest(path: Path | str) -> bool:
+def is_manifest(path: td.files.AnyPath | str) -> bool:
     return str(path).endswith(SUFFIX)
 
 
@@ -139,6 +139,16 @@ def load_manifest(path: Path) -> Manifest:
 
 def parsed_manifest(path: Path) -> Manifest:
     """As `load_manifest`. Raises RecordingError, which says only what is wrong."""
+    return Manifest(path, *_parsed(path))
+
+
+def segments_listed(path: td.files.AnyPath) -> tuple[Segment, ...]:
+    """Those of a manifest, wherever that is. Raises RecordingError."""
+    return _parsed(path)[0]
+
+
+def _parsed(path: td.files.AnyPath) -> tuple[tuple[Segment, ...], dict[str, int]]:
+    """Segments, and how many were deleted, by reason."""
     try:
         document = json.loads(td.files.read_whole(path, MANIFEST_MOST))
     except OSError as e:
@@ -159,7 +169,7 @@ def parsed_manifest(path: Path) -> Manifest:
     counts = {str(reason): _count(n, f"{path}: deleted") for reason, n in deleted.items()}
     if sum(counts.values()) > NUMBER_MOST:
         raise RecordingError(f"{path}: deleted: expected at most {NUMBER_MOST} segments")
-    return Manifest(path, segments, counts)
+    return segments, counts
 
 
 _KINDS: dict[str, Any] = {f.name: f.type for f in fields(Segment)}

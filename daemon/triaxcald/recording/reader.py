@@ -20,9 +20,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
 
 import triaxcal_drivers as td
-from triaxcald.errors import RecordingError
+from triaxcald.errors import DiskError, RecordingError
+from triaxcald.files import is_of_the_disk
 from triaxcald.recording import schema
-from triaxcald.recording.manifest import Manifest, Segment, is_manifest, load_manifest
+from triaxcald.recording.manifest import Manifest, Segment, is_manifest, load_manifest, segments_listed
 from triaxcald.recording.mcap_records import (
     HEAD,
     MAGIC,
@@ -262,20 +263,24 @@ class Recording(Contents):
         self._unconfirmed = schema.unconfirmed_from(self.metadata)
 
     @classmethod
-    def open(cls, path: Path, *, unfinished: bool = False) -> Recording:
+    def open(cls, path: td.files.AnyPath, *, unfinished: bool = False) -> Recording:
         try:
             stream = td.files.open_file(path)
         except OSError as e:
             raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
         try:
             recording = cls(stream, str(path), unfinished=unfinished)
+        except OSError as e:
+            stream.close()
+            kind = DiskError if is_of_the_disk(e) else RecordingError
+            raise kind(f"{path}: reading failed: {e.strerror or e}") from e
         except BaseException:
             stream.close()
             raise
         recording._heed_manifest(path)
         return recording
 
-    def _heed_manifest(self, path: Path) -> None:
+    def _heed_manifest(self, path: td.files.AnyPath) -> None:
         """Take the unconfirmed records from the manifest beside the segment, which may
         have been closed before an exchange of the unit was noticed."""
         own = self.metadata.get(schema.SEGMENT_RECORD, {})
@@ -283,7 +288,7 @@ class Recording(Contents):
         if not is_manifest(of) or Path(of).name != of:
             return
         with suppress(RecordingError):  # a segment can be read alone
-            for segment in load_manifest(path.with_name(of)).segments:  # by number: a mended file has another name
+            for segment in segments_listed(path.with_name(of)):  # by number: a mended file has another name
                 if str(segment.number) == own.get("number") and segment.unconfirmed is not None:
                     known = segment.unconfirmed if self._unconfirmed is None else self._unconfirmed
                     self._unconfirmed = min(known, segment.unconfirmed)
@@ -340,7 +345,8 @@ class Recording(Contents):
         try:
             return unparsed_at(self._stream, self.name, offset, self.size)
         except OSError as e:
-            raise RecordingError(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
+            kind = DiskError if is_of_the_disk(e) else RecordingError
+            raise kind(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
 
     def _survey(self) -> None:
         """Index the file, and check the two CRCs that together cover every byte."""
@@ -511,7 +517,7 @@ def _alike(one: bytes, other: bytes) -> bool:
         return False
 
 
-def digest_of(path: Path) -> str:
+def digest_of(path: td.files.AnyPath) -> str:
     """SHA-256 of the whole file. Raises RecordingError."""
     try:
         digest = hashlib.sha256()
@@ -523,10 +529,14 @@ def digest_of(path: Path) -> str:
         raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
 
 
-def open_recording(path: Path, *, unfinished: bool = False, alike: bool = True) -> Recording | Series:
+def open_recording(path: td.files.AnyPath, *, unfinished: bool = False, alike: bool = True) -> Recording | Series:
     """One file, or all that a manifest names, as `Recording` and `Series` have
     them. Raises RecordingError."""
-    return Series(path, alike=alike) if is_manifest(path) else Recording.open(path, unfinished=unfinished)
+    if not is_manifest(path):
+        return Recording.open(path, unfinished=unfinished)
+    if not isinstance(path, Path):
+        raise RecordingError(f"{path}: a recording in segments is read from a folder; copy it to one")
+    return Series(path, alike=alike)
 
 
 def is_recording(name: str) -> bool:

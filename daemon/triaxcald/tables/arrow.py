@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -139,7 +139,7 @@ def read_text(text: str, separator: str, decimal: str, fields: int) -> tuple[lis
     return [replace(_of_text(c, decimal), cells=c) for c in (c.combine_chunks() for c in table.columns)], ragged
 
 
-def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
+def read_parquet(path: td.files.AnyPath) -> tuple[list[str], list[Column]]:
     """Names and columns, nested ones by their path as in a.b. Raises
     InputError."""
     import pyarrow as pa
@@ -360,6 +360,28 @@ def write_rows(path: Path, types: Mapping[str, type], rows: Iterable[Sequence[An
                 pa.array(column, field.type) for column, field in zip(zip(*block, strict=True), schema, strict=True)
             ]
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+
+
+def read_rows(path: Path) -> tuple[list[str], Iterator[dict[str, Any]]]:
+    """The columns of a Parquet file, and its rows as they are read. Raises
+    InputError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(path)
+    except (OSError, pa.ArrowException) as e:
+        raise InputError(f"{path}: not readable as Parquet: {str(e).splitlines()[0]}") from e
+
+    def rows() -> Iterator[dict[str, Any]]:
+        try:
+            with file:
+                for batch in file.iter_batches(ROWS_AT_ONCE):
+                    yield from batch.to_pylist()
+        except (OSError, pa.ArrowException) as e:
+            raise InputError(f"{path}: not readable as Parquet: {str(e).splitlines()[0]}") from e
+
+    return list(file.schema_arrow.names), rows()
 
 
 def _array(values: Any) -> pa.Array:

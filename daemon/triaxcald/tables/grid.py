@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class Grid:
         return bool(in_seconds) and all(self.names.count(name) == 1 for name in REQUIRED)
 
 
-def grid_of_parquet(path: Path) -> Grid:
+def grid_of_parquet(path: td.files.AnyPath) -> Grid:
     """Raises InputError."""
     names, columns = arrow.read_parquet(path)
     return Grid(tuple(names), ("",) * len(names), True, tuple(columns), lambda row: f"row {row + 1}")

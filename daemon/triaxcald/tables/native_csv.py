@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.errors import InputError, RecordingError
+from triaxcald.stores import path_of
 
 # The bytes of a table, a few MiB at a time: of a file, a gzip file, a pipe or
 # standard input.
@@ -45,7 +46,7 @@ def blocks(source: Path | str | BinaryIO, label: str) -> Iterator[bytes]:
     else:
         packed = str(source).endswith(".gz")
         try:
-            with td.files.open_file(Path(source), pipe=not packed) as file:
+            with td.files.open_file(path_of(str(source)), pipe=not packed) as file:
                 if packed:
                     with gzip.GzipFile(fileobj=file) as unzipped:
                         yield from _of(unzipped, label, file)

@@ -17,6 +17,7 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.decoded import SampleRate
 from triaxcald.errors import InputError
+from triaxcald.stores import path_of
 from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
@@ -594,7 +595,7 @@ def read_table(name: str, reading: Reading | None = None, *, beside: bool = Fals
     label = label_of(name)
     try:
         if name.endswith((".parquet", ".pq")):
-            return _table_of(grid_of_parquet(Path(name)), reading, beside)
+            return _table_of(grid_of_parquet(path_of(name)), reading, beside)
         data = blocks(name, label)
         first = next(data, b"")
         if known := td.files.document_kind(first):
@@ -624,12 +625,18 @@ def _applied_again(name: str, label: str, first: bytes) -> Grid | None:
     """What `triaxcal apply` wrote, of a file, though its ``first`` block holds
     numbers alone: a column may have its first gap far behind."""
     try:
-        if not Path(name).is_file() or not is_applied(header_of(whole_lines(first), label)[1]):
+        if not _is_file(name) or not is_applied(header_of(whole_lines(first), label)[1]):
             return None
         whole = b"".join(blocks(name, label))
         return grid_of_own(whole, label) if holds_text(whole) else None
     except InputError:
         return None
+
+
+def _is_file(name: str) -> bool:
+    """Not a pipe, which can be read once."""
+    path = path_of(name)
+    return path.is_file() if isinstance(path, Path) else True
 
 
 def _used(reading: Reading, header: tuple[str, ...] | None, fields: int) -> Collection[int] | None:

@@ -126,7 +126,7 @@ def test_the_recording_says_on_which_computer_it_was_made(finished_run: Any, aud
     assert then == now
     certificate = json.loads(finished_run.can.with_suffix(f".{CERTIFICATE}").read_text())
     assert {key: certificate["software"][key] for key in KEYS} == dict(then)
-    document = text.document(text.Audited(str(finished_run.can), found))
+    document = text.document(str(finished_run.can), found)
     assert document["result"] == "same_bytes"
     assert document["largest_difference"] is None
     assert document["computer"] == {"then": then, "now": now}

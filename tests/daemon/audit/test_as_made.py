@@ -22,10 +22,10 @@ from tests.daemon.audit.other_software import GOLDEN, made_with
 from tests.daemon.audit.wheel_making import needs_of, of_source, repacked, small_wheel
 from triaxcald.audit import as_made
 from triaxcald.audit.as_made import Part, Software, document_of, grouped, required, worst_of
-from triaxcald.audit.many import Audited
 from triaxcald.audit.wheels import Wheels
 from triaxcald.cli.commands import main
 from triaxcald.errors import RecordingError
+from triaxcald.many import Unusable
 
 VERSIONS = {"triaxcal": "0.1.9", "numpy": "1.26.0", "scipy": "1.11.0", "matplotlib": "3.8.0", "jinja2": "3.1.0"}
 PROGRAM = """
@@ -301,7 +301,7 @@ def test_an_audit_that_leaves_no_document_is_an_error_of_its_recordings() -> Non
             json.dumps({"audits": [{"recording": "c", "differences": ["x"], "error": None}]}).encode(),
         ),
     ]
-    document = document_of(parts, [Audited("e", None, "damaged", 2)], ["e", "d", "c", "b", "a"])
+    document = document_of(parts, [Unusable("e", "damaged", 2)], ["e", "d", "c", "b", "a"])
     errors = {audit["recording"]: audit["error"] for audit in document["audits"]}
     assert list(errors) == ["e", "d", "c", "b", "a"]
     assert "ended with 4" in errors["a"]

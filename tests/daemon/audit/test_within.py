@@ -17,7 +17,6 @@ from triaxcald.audit import Audit, audit, text
 from triaxcald.audit.conduct import Result
 from triaxcald.audit.differences import differing
 from triaxcald.audit.figures import Agreement, Figures
-from triaxcald.audit.many import Audited
 from triaxcald.audit.results import Again, as_stored, compute, digests
 from triaxcald.audit.within import moved, same_within
 from triaxcald.provision.registers import checksum_of
@@ -65,7 +64,7 @@ def test_a_figure_within_the_limit_agrees_and_is_stated(audited: Any, software: 
     assert (found.within.largest.part, found.within.largest.place) == (CERTIFICATE, BIAS)
     assert found.within.largest.of_uncertainty == pytest.approx(0.005, rel=1e-3)
     assert BIAS in text.heading(found)
-    document = text.document(Audited("x.mcap", found))
+    document = text.document("x.mcap", found)
     assert document["result"] == "within"
     assert document["within"]["limit"] == LIMIT
     assert document["within"]["largest"]["place"] == BIAS
@@ -95,7 +94,7 @@ def test_the_option_is_not_for_recordings_of_the_same_software(audited: Any) -> 
     found = audited({}, bias_moved(0.005))
     assert found.result is Result.DIFFERS
     assert found.within is None
-    assert text.document(Audited("x.mcap", found))["within"] is None
+    assert text.document("x.mcap", found)["within"] is None
 
 
 @pytest.mark.slow

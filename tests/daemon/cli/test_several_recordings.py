@@ -100,7 +100,7 @@ def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -
     assert parsed(parser(), between) == parsed(parser(), behind)
     triaxcal("diagnose", one, "--sign=+,+,+", one, "--json").failed(2, "one.csv", "given twice")
     audits = parsed(parser(), ["audit", str(one), "--json", str(two)])
-    assert (audits.recordings, audits.json) == (runs, True)
+    assert (audits.recordings, audits.json) == ([str(one), str(two)], True)
     provision = parsed(parser(), ["provision", "cal.json", "--dry-run", "station.toml"])
     assert (provision.calibration, str(provision.station), provision.dry_run) == ("cal.json", "station.toml", True)
 

@@ -12,7 +12,7 @@ import pytest
 
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Gap, RawBatch
-from triaxcald.audit import audit_each, to_audit
+from triaxcald.audit import audit
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording import writer as writer_module
@@ -660,9 +660,8 @@ def test_no_result_of_a_recording_in_segments_is_audited(
 ) -> None:
     with new() as writer:
         minutes(writer, 1)
-    [audited] = audit_each(to_audit([tmp_path / "rec.segments.json"]))
-    assert audited.exit_code == 2
-    assert "a recording in segments, which holds no result to audit" in str(audited.error)
+    with pytest.raises(RecordingError, match="a recording in segments, which holds no result to audit"):
+        audit(tmp_path / "rec.segments.json")
 
 
 def test_the_manifest_is_whole_at_any_moment(

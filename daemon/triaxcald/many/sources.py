@@ -1,0 +1,171 @@
+"""Which recordings are meant: files, folders, patterns, lists, and URLs of stores."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import triaxcal_drivers as td
+from triaxcald.errors import DISK, DaemonError, InputError, exit_code_of
+from triaxcald.files import is_of_the_disk
+from triaxcald.stores import Listed, StoreFile, files_like, files_under, is_url, path_of
+
+LIST: Final = (".list", ".manifest")
+"""Ends of names of a manifest: a list of recordings, one a line."""
+LIST_MOST: Final = 2**29
+"""Bytes of a list: four million paths."""
+LINE_MOST: Final = 4096
+_WILD: Final = frozenset("*?[")
+_SEGMENT: Final = re.compile(r"(.+)-\d{6,18}\.mcap")
+MANIFEST: Final = ".segments.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording. ``stamp`` changes with its contents: the modification time [ns], or
+    the ETag of a store; both are empty where it does not tell."""
+
+    name: str
+    size: int | None = None
+    stamp: str = ""
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """What was asked for and names no recording."""
+
+    name: str
+    error: str
+    exit_code: int
+
+
+Found = Source | Unusable
+
+
+def sources_of(
+    asked: Sequence[str], endings: tuple[str, ...], *, without: Iterable[Path] = (), lists: tuple[str, ...] = LIST
+) -> list[Found]:
+    """Recordings, folders of recordings, patterns, lists and URLs, in the order in
+    which they are given, each recording once. What names no recording is its own error.
+    ``endings`` are those of recordings in a folder, ``lists`` those of manifests; the
+    files ``without`` are none."""
+    own = {path.absolute() for path in without}
+    found: dict[str, Found] = {}
+    for given in asked:
+        try:
+            for source in _sources_of(given, endings, lists):
+                if not own or is_url(source.name) or Path(source.name).absolute() not in own:
+                    found.setdefault(source.name, source)
+        except DaemonError as e:
+            found[given] = Unusable(given, str(e), exit_code_of(e))
+        except OSError as e:
+            code = DISK if is_of_the_disk(e) else 2
+            found[given] = Unusable(given, f"{given}: {e.strerror or e}", code)
+    return list(found.values())
+
+
+def _sources_of(given: str, endings: tuple[str, ...], lists: tuple[str, ...]) -> Iterable[Found]:
+    """Raises InputError, OSError."""
+    if given == "-":
+        raise InputError("-: standard input is no recording among many; give files")
+    if given.endswith(lists) and not _is_folder(given):
+        return list(_of_list(given))
+    if is_url(given) and not given.startswith("file://"):
+        return _in_store(given, endings)
+    return _in_folder(path_of(given), endings)
+
+
+def _is_folder(given: str) -> bool:
+    path = path_of(given)
+    return isinstance(path, Path) and path.is_dir()
+
+
+def _in_store(url: str, endings: tuple[str, ...]) -> list[Found]:
+    if _WILD & set(url.partition("?")[0] if url.startswith("http") else url):
+        found = files_like(url)
+        if not found:
+            raise InputError(f"{url}: no file in the store has a name like this")
+        return [_stored(listed) for listed in found]
+    file = StoreFile(url)
+    if file.name.endswith(endings):
+        return [_one(url, file)]
+    found = files_under(url, endings)
+    if not found:
+        raise InputError(f"{url}: no recording ({', '.join(endings)}) is in this folder of the store")
+    return [_stored(listed) for listed in found]
+
+
+def _one(name: str, file: StoreFile) -> Found:
+    try:
+        return _stored(file.listed())
+    except OSError as e:
+        return Unusable(name, f"{name}: cannot be read: {e.strerror or e}", DISK if is_of_the_disk(e) else 2)
+
+
+def _stored(of: Listed) -> Source:
+    return Source(of.url, of.size, of.stamp)
+
+
+def _in_folder(given: td.files.AnyPath, endings: tuple[str, ...]) -> list[Found]:
+    assert isinstance(given, Path)
+    if given.is_dir():
+        paths = sorted(path for path in given.rglob("*") if path.name.endswith(endings) and not path.is_dir())
+        if MANIFEST in endings:
+            paths = _without_segments(paths)
+        if not paths:
+            raise InputError(f"{given}: Is a directory, without a recording ({', '.join(endings)}) in it")
+        return [_local(path) for path in paths]
+    if not given.exists() and _WILD & set(str(given)):
+        matches = sorted(map(Path, glob.glob(str(given), recursive=True)))
+        if not matches:
+            raise InputError(f"{given}: no file has a name like this")
+        return [s for of in matches for s in (_in_folder(of, endings) if of.is_dir() else [_local(of)])]
+    return [_local(given)]
+
+
+def _without_segments(paths: list[Path]) -> list[Path]:
+    """A manifest stands for its segments."""
+    series = {str(path).removesuffix(MANIFEST) for path in paths if path.name.endswith(MANIFEST)}
+    return [p for p in paths if not ((match := _SEGMENT.fullmatch(str(p))) and match[1] in series)]
+
+
+def _local(path: Path) -> Source:
+    """One that is not there is found so by who opens it."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return Source(str(path))
+    return Source(str(path), status.st_size, str(status.st_mtime_ns))
+
+
+def _of_list(name: str) -> Iterator[Found]:
+    """Recordings of a list: a path or URL a line, relative to the list; lines that
+    begin with # are comments. Raises InputError, OSError."""
+    where = path_of(name)
+    try:
+        lines = td.files.read_whole(where, LIST_MOST).decode().splitlines()
+    except UnicodeDecodeError as e:
+        raise InputError(f"{name}: not UTF-8 text (byte {e.start}), expected a path or URL a line") from e
+    count = 0
+    for number, line in enumerate(lines, start=1):
+        entry = line.strip()
+        if not entry or entry.startswith("#"):
+            continue
+        if len(entry) > LINE_MOST or "\0" in entry:
+            raise InputError(f"{name}, line {number}: expected a path or URL of at most {LINE_MOST} characters")
+        count += 1
+        if is_url(entry) and not entry.startswith("file://"):
+            yield _one(entry, StoreFile(entry))
+        elif isinstance(where, Path):
+            path = path_of(entry)
+            assert isinstance(path, Path)
+            yield _local(where.parent / path)
+        else:
+            url = f"{where.parent}/{entry}"
+            yield _one(url, StoreFile(url))
+    if not count:
+        raise InputError(f"{name}: no recording is in this list")

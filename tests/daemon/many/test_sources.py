@@ -1,0 +1,78 @@
+"""Which recordings are meant by files, folders, patterns, manifests and URLs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from triaxcald.many import Source, Unusable, sources_of
+
+MCAP = (".mcap",)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("b.mcap", "a.mcap", "below/c.mcap", "notes.md", "t.csv"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(name)
+    return tmp_path
+
+
+def names(asked: list[str], endings: tuple[str, ...] = MCAP, **more: object) -> list[str]:
+    return [Path(of.name).name for of in sources_of(asked, endings, **more)]  # type: ignore[arg-type]
+
+
+def test_a_folder_stands_for_the_recordings_in_it_and_below_in_order(folder: Path) -> None:
+    found = sources_of([str(folder)], MCAP)
+    assert [Path(of.name).relative_to(folder).as_posix() for of in found] == ["a.mcap", "b.mcap", "below/c.mcap"]
+    assert found[0] == Source(str(folder / "a.mcap"), 6, str((folder / "a.mcap").stat().st_mtime_ns))
+
+
+def test_each_recording_counts_once_where_it_was_first_given(folder: Path) -> None:
+    assert names([str(folder / "b.mcap"), str(folder), str(folder / "*.mcap")]) == ["b.mcap", "a.mcap", "c.mcap"]
+
+
+def test_the_table_itself_is_no_recording(folder: Path) -> None:
+    assert names([str(folder)], (".mcap", ".csv")) == ["a.mcap", "b.mcap", "c.mcap", "t.csv"]
+    assert names([str(folder)], (".mcap", ".csv"), without=[folder / "t.csv"]) == ["a.mcap", "b.mcap", "c.mcap"]
+
+
+def test_a_manifest_lists_paths_from_its_own_folder(folder: Path) -> None:
+    manifest = folder / "below" / "all.list"
+    manifest.write_text(f"# two shifts\n\n  c.mcap\n../a.mcap\n{folder}/b.mcap\ngone.mcap\n")
+    assert names([str(manifest)]) == ["c.mcap", "a.mcap", "b.mcap", "gone.mcap"]
+    assert sources_of([str(manifest)], MCAP)[-1] == Source(str(folder / "below" / "gone.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"# nothing\n\n", "no recording is in this list"),
+        (b"\xff\xfe\n", "not UTF-8 text (byte 0)"),
+        (b"a.mcap\n" + b"x" * 5000, "line 2: expected a path or URL of at most 4096 characters"),
+        (b"a\0b\n", "line 1: expected a path or URL"),
+    ],
+)
+def test_what_is_no_manifest_is_named_with_its_line(tmp_path: Path, content: bytes, words: str) -> None:
+    manifest = tmp_path / "all.list"
+    manifest.write_bytes(content)
+    [found] = sources_of([str(manifest)], MCAP)
+    assert isinstance(found, Unusable)
+    assert words in found.error
+    assert found.exit_code == 2
+
+
+def test_what_names_no_recording_hides_no_other(folder: Path) -> None:
+    (folder / "empty").mkdir()
+    found = sources_of([str(folder / "empty"), str(folder / "x*"), str(folder / "a.mcap"), "odd://x"], MCAP)
+    assert [type(of) for of in found] == [Unusable, Unusable, Source, Unusable]
+    assert {of.exit_code for of in found if isinstance(of, Unusable)} == {2}
+
+
+def test_a_manifest_of_segments_stands_for_its_segments(tmp_path: Path) -> None:
+    for name in ("a.segments.json", "a-000001.mcap", "a-000002.mcap", "b-000001.mcap"):
+        (tmp_path / name).touch()
+    assert names([str(tmp_path)], (".mcap", ".segments.json")) == ["a.segments.json", "b-000001.mcap"]
+    assert names([str(tmp_path)]) == ["a-000001.mcap", "a-000002.mcap", "b-000001.mcap"]
