@@ -326,7 +326,8 @@ def audit_as_made(
 ) -> Iterator[Part]:
     """Audit ``recordings`` that one software made. Text goes to the standard streams as
     it comes; ``as_json`` keeps the document. ``begins`` is called before long work,
-    with what it is; ``notes`` with what the caller should know."""
+    with what it is, and with nothing before an audit, which says so itself; ``notes``
+    with what the caller should know."""
     python = interpreter_for(software.python)
     if python.note:
         notes(f"note: {python.note}")
@@ -336,9 +337,11 @@ def audit_as_made(
     except InputError as e:
         yield Part(tuple(recordings), exit_code_of(e), error=str(e))
         return
+    finally:
+        begins("")
     for i in range(0, len(recordings), RECORDINGS_MOST):
         some = tuple(recordings[i : i + RECORDINGS_MOST])
-        begins(f"auditing {tc.number_format.number_of(len(some), 'recording')} with {software}")
+        notes(f"note: {tc.number_format.number_of(len(some), 'recording')} under {software}")
         yield _audited(inner, some, as_json=as_json)
 
 

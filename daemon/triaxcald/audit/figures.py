@@ -62,10 +62,12 @@ class Agreement:
 class Figures:
     """Those of a document that was computed again: their uncertainties by
     place, and the digits of all of them. ``share`` of its uncertainty is how far
-    a figure may be off and be the same."""
+    a figure may be off and be the same; ``derived`` are uncertainties, by place,
+    that follow from those in the document."""
 
     document: Mapping[str, Any]
     share: float = SHARE
+    derived: Mapping[str, float] = field(default_factory=dict)
     uncertainties: Mapping[str, float] = field(init=False)
     digits: Sequence[float] = field(init=False)
 
@@ -101,8 +103,8 @@ class Figures:
         return again
 
     def uncertainty_of(self, place: str, figure: float) -> float | None:
-        """Of the ``figure`` at the ``place``; None where the document states none."""
-        return self.uncertainties.get(place) or getattr(figure, "known_to", None)
+        """Of the ``figure`` at the ``place``; None where there is none."""
+        return self.derived.get(place) or self.uncertainties.get(place) or getattr(figure, "known_to", None)
 
     def same_words(self, stored: str, again: str) -> bool:
         """Whether two sentences have the same words, and numerals that are the
@@ -137,10 +139,10 @@ def furthest(stored: Any, again: Any) -> tuple[float, str] | None:
     """Of two calibrations by different versions: the largest difference between
     two coefficients, as a share of the standard error of the one computed
     ``again``, and its place; None where they have none in common."""
-    values, errors = dict(_placed(stored)), dict(_stated({"standard_error": again.get("standard_error", {})}))
+    values, errors = dict(placed(stored)), dict(_stated({"standard_error": again.get("standard_error", {})}))
     for name, coefficients in again.get("effects", {}).items():
         errors |= _stated(coefficients, inside("effects", name))
-    now = dict(_placed(again))
+    now = dict(placed(again))
     shares = [
         (abs(values[at] - now[at]) / error, at)
         for at, error in errors.items()
@@ -157,7 +159,8 @@ def same_figure(stored: float, again: tc.rounding.Printed, uncertainty: float | 
     # A number on the edge between two printed ones may stand as either.
     steps = stored / again.step if again.step else 0.0
     is_printed = abs(steps - round(steps)) <= RELATIVE * max(1.0, abs(steps)) if abs(steps) < 1e15 else False
-    return is_printed and abs(stored - again.exact) <= (0.5 + EDGE) * again.step
+    within = share * (uncertainty or 0.0) if share > SHARE else 0.0
+    return is_printed and abs(stored - again.exact) <= (0.5 + EDGE) * again.step + within
 
 
 def _stated(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
@@ -170,7 +173,7 @@ def _stated(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
         return
     of_value, of_pose = node.get("standard_error"), node.get("standard_error_g")
     if isinstance(of_value, Mapping):
-        yield from _placed(of_value, at)
+        yield from placed(of_value, at)
     elif of_value:
         yield inside(at, "value"), of_value
     if of_pose:
@@ -180,7 +183,7 @@ def _stated(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
     if "centre" in node:
         yield from _of_transformation(node, at)
     if "correlation" in node:
-        yield from ((place, CORRELATION) for place, _ in _placed(node["correlation"], inside(at, "correlation")))
+        yield from ((place, CORRELATION) for place, _ in placed(node["correlation"], inside(at, "correlation")))
     if "significant" in node and node["rms_g"]:  # of what no effect explains: an estimate, known to its own size
         yield inside(at, "rms_g"), node["rms_g"]
     if "budget" in node:
@@ -214,7 +217,7 @@ def _of_lines(budget: Mapping[str, Any], at: str) -> Iterator[tuple[str, float]]
     combined, whole = _combined(budget), budget["magnitude"]["standard_g"]
     for i, line in enumerate(budget["budget"]):
         place = f"{inside(at, 'budget')}[{i}]"
-        for inner, value in _placed({key: line[key] for key in budget["expanded"]}):
+        for inner, value in placed({key: line[key] for key in budget["expanded"]}):
             yield inside(place, inner), _of_line(value, combined[inner])
         yield inside(place, "magnitude_g"), _of_line(line["magnitude_g"], whole)
         yield inside(place, "share"), max(line["share"] or 0.0, LINE / SHARE)
@@ -228,8 +231,8 @@ def _of_line(value: float | None, combined: float | None) -> float:
 
 def _combined(budget: Mapping[str, Any]) -> dict[str, float | None]:
     """The combined standard uncertainties of a budget, by place."""
-    coverage = dict(_placed(budget["coverage_factor"]))
-    return {place: v / coverage[place] if v and coverage[place] else None for place, v in _placed(budget["expanded"])}
+    coverage = dict(placed(budget["coverage_factor"]))
+    return {place: v / coverage[place] if v and coverage[place] else None for place, v in placed(budget["expanded"])}
 
 
 def _place_of(role: str) -> str:
@@ -238,25 +241,32 @@ def _place_of(role: str) -> str:
     return f"{group}[{'xyz'.index(name)}]" if group in td.roles.LINEAR else f"effects.{role}"
 
 
-def _placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:
+def placed(node: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     """The leaves of a document, by place."""
     if isinstance(node, Mapping):
         for key, inner in node.items():
-            yield from _placed(inner, inside(at, key))
+            yield from placed(inner, inside(at, key))
     elif isinstance(node, list):
         for i, inner in enumerate(node):
-            yield from _placed(inner, f"{at}[{i}]")
+            yield from placed(inner, f"{at}[{i}]")
     else:
         yield at, node
 
 
 def _printed(document: Any) -> Iterator[tc.rounding.Printed]:
-    return (leaf for _, leaf in _placed(document) if isinstance(leaf, tc.rounding.Printed))
+    return (leaf for _, leaf in placed(document) if isinstance(leaf, tc.rounding.Printed))
+
+
+def beyond_rounding(stored: float, again: float) -> float:
+    """The difference of two figures beyond what their rounding makes."""
+    if not isinstance(again, tc.rounding.Printed):
+        return abs(stored - again)
+    return min(abs(stored - again), max(0.0, abs(stored - again.exact) - (0.5 + EDGE) * again.step))
 
 
 def figures_of(document: Any) -> Iterator[tuple[str, float]]:
     """Those of a document, by place."""
-    return ((at, leaf) for at, leaf in _placed(document) if isinstance(leaf, float))
+    return ((at, leaf) for at, leaf in placed(document) if isinstance(leaf, float))
 
 
 def inside(at: str, key: str) -> str:

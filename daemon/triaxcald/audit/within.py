@@ -9,7 +9,7 @@ from typing import Any
 
 import triaxcal as tc
 import triaxcal_drivers as td
-from triaxcald.audit.figures import Agreement, Figures, figures_of
+from triaxcald.audit.figures import SHARE, Agreement, Figures, beyond_rounding, figures_of, inside
 from triaxcald.audit.results import Again, stored_certificate
 from triaxcald.certificate import Certified, with_registers
 from triaxcald.outcome import CERTIFICATE
@@ -22,18 +22,15 @@ COMPUTES = ("triaxcal", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Moved:
-    """A figure that does not come out the same. ``uncertainty`` is the one that the
-    document states of it, None where it states none."""
+    """A figure that does not come out the same, and by how much of its ``uncertainty``
+    both differ beyond their rounding. None where the figure has no uncertainty."""
 
     part: str
     place: str
     stored: float
     again: float
     uncertainty: float | None
-
-    @property
-    def of_uncertainty(self) -> float | None:
-        return abs(self.stored - self.again) / self.uncertainty if self.uncertainty else None
+    of_uncertainty: float | None
 
 
 @dataclass(frozen=True)
@@ -68,11 +65,13 @@ def moved(again: Again, stored: Mapping[str, Mapping[str, Any] | None]) -> Itera
         held = stored_certificate(stored) if part == CERTIFICATE else stored.get(part)
         if document is None or not held:
             continue
-        figures, then = Figures(document), dict(figures_of(held))
+        figures, then = _figures(document), dict(figures_of(held))
         for place, figure in figures_of(document):
             before = then.get(place)
             if before is not None and before != figure:
-                yield Moved(part, place, before, float(figure), figures.uncertainty_of(place, figure))
+                known = figures.uncertainty_of(place, figure)
+                share = beyond_rounding(before, figure) / known if known else None
+                yield Moved(part, place, before, float(figure), known, share)
 
 
 def same_within(
@@ -90,11 +89,72 @@ def same_within(
     certificate, checked = stored_certificate(stored), stored.get(VERIFICATION_FILE)
     if certified is not None:
         certified = _words_within(again, certified, certificate, limit)
-        document = Figures(certified.document, limit).taken(CERTIFICATE, certificate, agreement)
+        document = _figures(certified.document, limit).taken(CERTIFICATE, certificate, agreement)
         certified = replace(certified, document=document)
     if verification is not None and checked is not None:
-        verification = Figures(verification, limit).taken(VERIFICATION_FILE, checked, agreement)
+        verification = _figures(verification, limit).taken(VERIFICATION_FILE, checked, agreement)
     return replace(again, certified=certified, verification=verification)
+
+
+def _figures(document: Mapping[str, Any], limit: float = SHARE) -> Figures:
+    return Figures(document, limit, dict(derived(document)))
+
+
+P_VALUE = 12**-0.5
+"""A p-value is uniform from 0 to 1 where nothing acts; this is its deviation."""
+_OF_RESIDUALS = ("rms_g", "max_abs_g", "cross_validated_rms_g", "before_rms_g", "after_max_abs_g")
+_OF_REGISTERS = (
+    "rms_g", "cost_rms_g", "rounding_rms_g", "left_rms_g", "left_largest_g", "own_rms_g.before", "own_rms_g.predicted",
+)  # fmt: skip
+_P_VALUES = ("lack_of_fit_p", "p_value")
+_PROBABILITIES = ("probability", "nothing_probability", "outlier_probability", "weight")
+
+
+def derived(node: Any, at: str = "") -> Iterator[tuple[str, float]]:
+    """Uncertainties, by place, of figures that follow from others in the document."""
+    if isinstance(node, list):
+        for i, inner in enumerate(node):
+            yield from derived(inner, f"{at}[{i}]")
+    if not isinstance(node, Mapping):
+        return
+    for place, uncertainty in (*_of_residuals(node), *_of_probabilities(node), *_of_places(node)):
+        yield inside(at, place), uncertainty
+    for key, inner in node.items():
+        yield from derived(inner, inside(at, key))
+
+
+def _of_residuals(node: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """Where each residual moves by a share of its standard error, their largest and
+    their rms move by at most about that share of the rms standard error (the noise
+    floor), and χ² per degree of freedom by its derivative. So do rms changes of the
+    magnitude in these poses, which the registers make."""
+    if floor := node.get("noise_floor_g"):
+        yield from ((key, floor) for key in _OF_RESIDUALS if key in node)
+        yield "noise_floor_g", tc.rounding.KNOWN_TO * floor
+    if chi2 := node.get("reduced_chi2"):
+        yield "reduced_chi2", max(1.0, 2 * chi2**0.5)
+    if node.get("registers") and "result" in node and (floor := node["result"]["after"]["noise_floor_g"]):
+        yield from ((f"registers.{key}", floor) for key in _OF_REGISTERS)
+
+
+def _of_probabilities(node: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """The odds of a posterior are known to a factor of e at best."""
+    of_effects = {f"probabilities.{name}": p for name, p in node.get("probabilities", {}).items()}
+    for place, p in ({key: node[key] for key in _PROBABILITIES if key in node} | of_effects).items():
+        if p:
+            yield place, p * (1 - p)
+    yield from ((key, P_VALUE) for key in _P_VALUES if key in node)
+
+
+def _of_places(node: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """A direction is known as well as the magnitude of its pose, and so is the place of
+    a pose, or of a curve through poses, in a trace."""
+    if "direction" in node and (error := node.get("standard_error_g")):
+        yield from ((f"direction[{i}]", error) for i in range(len(node["direction"])))
+    if "x" in node and (errors := node.get("error")):
+        yield from ((f"x[{i}]", error) for i, error in enumerate(errors))
+        curve = node.get("curve") or {}
+        yield from ((f"curve.x[{i}]", max(errors)) for i in range(len(curve.get("x", ()))))
 
 
 def _words_within(again: Again, certified: Certified, stored: Mapping[str, Any], limit: float) -> Certified:

@@ -17,7 +17,7 @@ from typing import Any
 
 import triaxcal_drivers as td
 from triaxcald.abort import AbortNotice, at_abort
-from triaxcald.cli.console import at, emit, say, show
+from triaxcald.cli.console import at, emit, erased, say, show
 from triaxcald.errors import BAD_INPUT, InputError, severest
 from triaxcald.many import (
     Column,
@@ -287,7 +287,7 @@ def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
         say(f"triaxcal: {one.error}")
     parts: list[as_made.Part] = []
     for software, recordings in found.items():
-        for part in as_made.audit_as_made(software, recordings, wheels, as_json=a.json, begins=at, notes=say):
+        for part in as_made.audit_as_made(software, recordings, wheels, as_json=a.json, begins=_at, notes=say):
             parts.append(part)
             if part.error is not None:
                 say(f"triaxcal: {part.error}")
@@ -296,6 +296,13 @@ def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
     elif a.json:
         emit(as_made.document_of(parts, failed, [one.name for one in asked]))
     return as_made.worst_of([part.exit_code for part in parts] + [one.exit_code for one in failed])
+
+
+def _at(what: str) -> None:
+    """Another program shows its own progress where there is nothing to say."""
+    if not what:
+        erased()
+    at(what)
 
 
 def _require_agreeing(a: argparse.Namespace) -> None:

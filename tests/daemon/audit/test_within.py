@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.daemon.audit.forging import OUTCOME, Forgery
@@ -20,6 +22,7 @@ from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.results import Again, as_stored, compute, digests
 from triaxcald.audit.within import moved, same_within
 from triaxcald.provision.registers import checksum_of
+from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.verification import verdict_by_limit
 
@@ -115,7 +118,7 @@ def test_without_a_moved_figure_everything_is_the_same(audited: Any) -> None:
         ),
         ({CERTIFICATE: lambda c: c["result"].update(call="investigate")}, "result.call"),
         ({CERTIFICATE: lambda c: c["registers"]["words"][0].update(raw="00000000")}, "registers.words[0].raw"),
-        ({CERTIFICATE: lambda c: c["result"]["after"].update(max_abs_g=2.1256e-5)}, "result.after.max_abs_g"),
+        ({CERTIFICATE: lambda c: c["recording"].update(seconds=90.24)}, "recording.seconds"),
     ],
     ids=["verdict", "call", "register", "without uncertainty"],
 )
@@ -215,15 +218,43 @@ def test_each_moved_figure_is_found_in_its_own_uncertainty(again: Again, stored:
     calibration = held[CERTIFICATE]["result"]["calibration"]
     calibration["scale_factor"][2] += 0.3 * calibration["standard_error"]["scale_factor"][2]
     calibration["poses"][3]["residual_g"] -= 2 * calibration["poses"][3]["standard_error_g"]
-    held[CERTIFICATE]["result"]["after"]["rms_g"] *= 1.5
+    held[CERTIFICATE]["recording"]["seconds"] += 1.0
     held[VERIFICATION]["poses"][1]["error_g"] += 0.1 * held[VERIFICATION]["poses"][1]["standard_error_g"]
     found = {(m.part, m.place): m.of_uncertainty for m in moved(again, held)}
     assert found == {
-        (CERTIFICATE, "result.after.rms_g"): None,
-        (CERTIFICATE, "result.calibration.scale_factor[2]"): pytest.approx(0.3),
-        (CERTIFICATE, "result.calibration.poses[3].residual_g"): pytest.approx(2.0),
-        (VERIFICATION, "poses[1].error_g"): pytest.approx(0.1),
+        (CERTIFICATE, "recording.seconds"): None,
+        (CERTIFICATE, "result.calibration.scale_factor[2]"): pytest.approx(0.3, rel=1e-3),
+        (CERTIFICATE, "result.calibration.poses[3].residual_g"): pytest.approx(2.0, rel=1e-3),
+        (VERIFICATION, "poses[1].error_g"): pytest.approx(0.1, rel=1e-3),
     }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("name", ["can-second-order.mcap", "modbus-temperature-bias.mcap"])
+def test_poses_that_move_by_a_thousandth_of_their_error_move_no_figure_by_a_tenth(
+    name: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with an arithmetic that rounds otherwise, and much more: only the means themselves have no uncertainty, and
+    the choice of poses that may be outliers is a choice."""
+    random, parted = np.random.default_rng(seed), Pipeline.parted
+
+    def moved_poses(self: Pipeline, turn_s: float | None) -> list[Any]:
+        return [
+            replace(p, mean=p.mean + 1e-3 * np.linalg.cholesky(p.covariance) @ random.standard_normal(3))
+            for p in parted(self, turn_s)
+        ]
+
+    monkeypatch.setattr(Pipeline, "parted", moved_poses)
+    with Recording.open(GOLDEN.with_name(name)) as recording:
+        again = compute(recording, digests(recording))
+        held = {n: json.loads(recording.attachments[n]) for n in (CERTIFICATE, VERIFICATION, OUTCOME)}
+    off = {re.sub(r"\[\d+\]", "[]", place).rpartition("poses[].")[2] for place in places_off(again, held, 0.1)}
+    assert {"mean[]"} <= off <= {"mean[]", "outlier_probability"}
+    found = [m for m in moved(again, held) if m.of_uncertainty is not None]
+    assert len(found) > 500
+    assert all(m.of_uncertainty < 0.1 for m in found if "outlier" not in m.place)
+    assert len(places_off(again, held, 1e-3)) > 200
 
 
 @pytest.mark.parametrize(
