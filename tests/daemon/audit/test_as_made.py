@@ -106,7 +106,7 @@ def test_a_recording_without_versions_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "no.mcap").write_bytes(b"no recording")
     found, failed = grouped([GOLDEN, silent, older, tmp_path / "no.mcap", GOLDEN])
     assert sorted(map(len, found.values())) == [1, 2]
-    assert [one.recording for one in failed] == [str(silent), str(tmp_path / "no.mcap")]
+    assert [one.name for one in failed] == [str(silent), str(tmp_path / "no.mcap")]
     assert {one.exit_code for one in failed} == {2}
 
 
