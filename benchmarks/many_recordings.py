@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks.table import Table
 from triaxcald.audit.many import COLUMNS, audited
 from triaxcald.cli.batch import Task
-from triaxcald.many import Settings, Source, open_table, sources_of
+from triaxcald.many import Finding, Settings, Source, open_table, sources_of
 from triaxcald.many.cluster import Cluster, cluster_at, local_cluster, results
 
 GOLDEN = Path(__file__).parents[1] / "recordings" / "can-second-order.mcap"
@@ -116,6 +116,21 @@ def workers_table(work: Any, sources: Sequence[Source], name: str) -> None:
     print(Table(f"{len(sources)} recordings through `{name}`", head, lines), flush=True)
 
 
+def nothing(path: object) -> Finding:
+    return Finding({})
+
+
+def handing_out_us(count: int) -> float:
+    """Processor time of this process, and of the scheduler in it, for each recording at which nothing is done."""
+    with tempfile.NamedTemporaryFile() as empty, local_cluster(1, MEMORY) as cluster:
+        for _ in results(cluster, nothing, [Source(empty.name)] * 20, Settings("benchmark")):
+            pass
+        began_s = sum(os.times()[:2])
+        for _ in results(cluster, nothing, [Source(empty.name)] * count, Settings("benchmark")):
+            pass
+        return (sum(os.times()[:2]) - began_s) / count * 1e6
+
+
 def asking_table(rows: int, folder: Path) -> None:
     """What lists, rows and tables of many recordings cost the process that asks."""
     lines = list[Sequence[str]]()
@@ -127,6 +142,7 @@ def asking_table(rows: int, folder: Path) -> None:
     began_s = time.perf_counter()
     found = sources_of([str(many)], (".mcap",))
     lines.append(["list of a folder, in memory", *_each(began_s, rows, (usage()[2] - before) * 1024)])
+    lines.append(["hand out and take back", f"{handing_out_us(min(rows, 1000)):.0f}", ""])
     row = {column.name: None for column in COLUMNS} | {
         "exit_code": 0, "result": "same_bytes", "verdict": "pass", "serial": "1001", "differences": 0, "seconds": 4.123,
         "run": "01a21f9f-759b-729d-b68e-7585ebf351b1", "size": 948162, "stamp": "1795953071899956811",

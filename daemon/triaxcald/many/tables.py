@@ -274,6 +274,7 @@ class SqliteTable(Table):
             self._db = sqlite3.connect(path, isolation_level=None)
             self._held = open(path, "rb")  # noqa: SIM115 - closed after the connection: closing drops its locks
             _lock(self._held, path)
+            self._db.execute("PRAGMA journal_mode = TRUNCATE")  # a row takes half the time
             self._begin(resume)
         except (sqlite3.Error, OSError) as e:
             raise InputError(f"{path}: cannot be used as a table of results: {_reason(e)}") from e
@@ -322,6 +323,7 @@ class SqliteTable(Table):
 
     def close(self) -> None:
         with suppress(sqlite3.Error):
+            self._db.execute("PRAGMA journal_mode = DELETE")
             self._db.close()
         if self._held is not None:
             self._held.close()

@@ -36,7 +36,7 @@ def _python(code: str, *arguments: str | Path) -> subprocess.CompletedProcess[st
 
 COMMANDS = [
     "demo", "run", "sim", "record", "poses", "fit", "diagnose", "apply", "verify", "frame", "plan", "provision",
-    "restore", "registers", "devices", "audit", "log",
+    "restore", "registers", "devices", "audit", "batch", "log",
 ]  # fmt: skip
 WORK = ["numpy", "scipy", "rich", "pydantic", "asyncio", "matplotlib", "can", "mcap", "pymodbus", "triaxcal"]
 
@@ -61,7 +61,8 @@ def test_every_command_has_a_function_that_runs_it_and_help_that_says_what_it_do
 def test_commands_that_compute_are_marked_where_they_are_declared() -> None:
     marked = {command.prog for command in leaves(parser()) if command.get_default("computes")}
     names = ("poses", "fit", "diagnose", "rezero", "apply", "verify", "frame", "plan", "serve", "audit")
-    assert marked == {f"triaxcal {name}" for name in names}
+    many = ("poses", "fit", "diagnose", "verify", "apply")
+    assert marked == {f"triaxcal {name}" for name in (*names, *(f"batch {name}" for name in many))}
 
 
 def test_without_a_command_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sqlite3
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.daemon.many.conftest import environment
 
 Run = Callable[..., Any]
 CASES = [
@@ -70,3 +73,20 @@ def test_a_missing_extra_is_named(
     monkeypatch.setitem(sys.modules, module, None)
     done = triaxcal(*(word.format(tmp_path / "t.csv") for word in arguments))
     done.failed(2, f"the package {module} is not installed; pip install 'triaxcal[fleet]' brings it")
+
+
+@pytest.mark.parametrize("command", [["audit"], ["batch", "poses"], ["poses"]])
+def test_one_recording_loads_neither_dask_nor_fsspec(tmp_path: Path, command: list[str]) -> None:
+    (tmp_path / "a.mcap").write_text("no recording")
+    code = """
+import sys
+from triaxcald.cli.commands import main
+code = main(sys.argv[1:])
+print(code, *({"dask", "distributed", "fsspec"} & set(sys.modules)))
+"""
+    table = ["-o", str(tmp_path / "t.csv")] if command[0] == "batch" else []
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command, str(tmp_path / "a.mcap"), *table],
+        env=environment(), capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    assert done.stdout.splitlines()[-1] == "2"
