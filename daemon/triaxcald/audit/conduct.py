@@ -37,6 +37,7 @@ from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import DEVICE, InputError, RecordingError
 from triaxcald.inputs import losses_of, parse_document
+from triaxcald.memory import little_garbage
 from triaxcald.outcome import ATTACHMENT, CERTIFICATE, FORMAT, REPORT, Verdict, digest_of
 from triaxcald.provision.correction import AT_START
 from triaxcald.provision.state import DeviceState, Held
@@ -110,7 +111,8 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
     ``compute`` makes the results again."""
     if is_manifest(path):
         raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
-    with Recording.open(path) as recording:
+    # Pictures are made of cycles: garbage is looked for seldom, not a hundred times.
+    with little_garbage(), Recording.open(path) as recording:
         require_of_unit(recording)
         if not recording.ends_with:
             raise RecordingError(
