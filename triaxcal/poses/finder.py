@@ -34,6 +34,7 @@ class PoseFinder:
         self._stillness = StillnessDetector()
         self._quality = QualityDetector()
         self._spans: tuple[int, list[Span]] = (0, [])
+        self._poses: tuple[int, dict[tuple[tuple[int, str], ...], list[Pose]]] = (0, {})
         self._findings: list[QualityFinding] | None = None
 
     def feed(self, time_ns: Any, readings: Any, channels: Mapping[str, Any] | None = None) -> None:
@@ -69,7 +70,8 @@ class PoseFinder:
 
     def part_by(self, turn_s: float | None) -> None:
         """Separate the poses with another ``turn_s`` from now on."""
-        self._turn_s, self._spans, self._findings = turn_s, (0, []), None
+        if turn_s != self._turn_s:
+            self._turn_s, self._spans, self._poses, self._findings = turn_s, (0, []), (0, {}), None
 
     @property
     def windows(self) -> Windows | None:
@@ -90,11 +92,18 @@ class PoseFinder:
 
     def poses(self, *, judged: bool = True) -> list[Pose]:
         """The poses so far. Those with faulty samples name the fault and do not
-        contribute to the noise of the others, unless ``judged`` is false."""
+        contribute to the noise of the others, unless ``judged`` is false. Cached for
+        the same windows."""
         windows = self.windows
         if windows is None:
             return []
-        return poses_of(windows, self.spans(), faulty_poses(self.findings()) if judged else None)
+        faults = faulty_poses(self.findings()) if judged else {}
+        if self._poses[0] != len(windows):
+            self._poses = (len(windows), {})
+        cached, key = self._poses[1], tuple(sorted(faults.items()))
+        if key not in cached:
+            cached[key] = poses_of(windows, self.spans(), faults)
+        return list(cached[key])
 
     def spans(self) -> list[Span]:
         """The still spans so far, cached for the same windows."""

@@ -29,11 +29,12 @@ from triaxcald.tables.native_csv import Rows, write_csv
 
 
 def info_command(a: argparse.Namespace) -> int:
-    document = describe(a.recording)
+    document = describe(a.recording, count=a.count)
     if "bus" not in document:  # beside the raw records of which they are made
         items = list(document.items())
         after = list(document).index("raw") + 1
-        document = dict([*items[:after], ("samples", _samples(a.recording, document["raw"])), *items[after:]])
+        samples = _samples(a.recording, document["raw"]) if document["counted"] else None
+        document = dict([*items[:after], ("samples", samples), *items[after:]])
     if a.json:
         emit(document)
     else:

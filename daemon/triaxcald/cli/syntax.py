@@ -812,6 +812,10 @@ def _logs(commands: Any) -> None:
         parts, "info", "recordings:info_command", "show the contents of a recording", "", "log info rec.mcap"
     )
     p.add_argument("recording", metavar="REC", type=Path)
+    p.add_argument(
+        "--count", action="store_true",
+        help="count every record and sample; by default of more than 1,000,000 raw records only what the index has",
+    )  # fmt: skip
     add_json(p)
     p = add_command(
         parts, "recover", "recordings:recover_command", "mend a recording that was cut short, and say what was lost",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,22 @@ from triaxcald.recording.bus import describe_bus, is_of_bus
 from triaxcald.recording.reader import Contents, Recording, Series, open_recording
 from triaxcald.recording.writer import ENDED
 
+COUNTED_MOST = 1_000_000
+"""Raw records that are counted in a second or two: of more, those that the index
+counts."""
 
-def describe(path: Path) -> dict[str, Any]:
+
+def describe(path: Path, *, count: bool = False) -> dict[str, Any]:
     """The recording's contents as a JSON document; also of one not finished, up
-    to its last whole record.
+    to its last whole record. ``count`` reads every record, also of a long recording
+    whose index has the numbers.
 
     Raises RecordingError.
     """
     with open_recording(path, unfinished=True, alike=False) as recording:
-        topics, events = _topics(recording), list(recording.events())
+        index = None if count or not is_long(recording) else recording.index()
+        topics = _topics(recording) if index is None else _counted(index.topics)
+        events = list(recording.events())
         starts = [topic["start_ns"] for topic in topics.values()]
         ends = [topic["end_ns"] for topic in topics.values()]
         return {
@@ -30,7 +37,8 @@ def describe(path: Path) -> dict[str, Any]:
             **(_segments(recording) if isinstance(recording, Series) else _file(recording)),
             "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
             "topics": topics,
-            "raw": _phases(recording),
+            "raw": _phases(recording) if index is None else _timed(_counted(index.phases)),
+            "counted": index is None,
             **_imported(events),
             "ended": next((_detail(e) for e in reversed(events) if e.kind == ENDED), None),
             **({"bus": describe_bus(recording)} if is_of_bus(recording) else {}),
@@ -45,6 +53,24 @@ def describe(path: Path) -> dict[str, Any]:
             "events": [{"time_ns": e.time_ns, "kind": e.kind, "detail": _detail(e)} for e in events],
             "losses": [asdict(loss) for loss in recording.losses()],
         }
+
+
+def is_long(recording: Contents) -> bool:
+    """Whether it says that it has more raw records than are counted unasked."""
+    if isinstance(recording, Series):
+        return sum(segment.records for segment in recording.manifest.segments) > COUNTED_MOST
+    records = recording.metadata.get(schema.RAW_RECORD, {}).get("records", "")
+    return records.isdecimal() and len(records) < 20 and int(records) > COUNTED_MOST
+
+
+def _counted(of: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    return {name: dict(vars(counts)) for name, counts in of.items()}
+
+
+def _timed(phases: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    for entry in phases.values():
+        entry["duration_s"] = (entry["end_ns"] - entry["start_ns"]) / 1e9
+    return phases
 
 
 def _detail(event: schema.Event) -> Any:

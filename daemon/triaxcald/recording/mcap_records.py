@@ -13,8 +13,9 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -37,6 +38,7 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from numpy.typing import NDArray
 
 import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
@@ -57,6 +59,8 @@ INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
 """Bytes of each message in the uncompressed index of the file; number of messages that
 may lack an index, those of a last chunk."""
 _BLOCK = 2**16  # bytes read at once
+_FOOTER_BYTES = 20  # of the body of a footer record
+_INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of the entries
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
@@ -212,6 +216,57 @@ def footer_fits(unparsed: UnparsedRecord, crc: int) -> bool:
     ``crc``."""
     (expected,) = struct.unpack("<I", unparsed.body[-4:])
     return expected in (0, zlib.crc32(unparsed.body[:-4], zlib.crc32(unparsed.head, crc)))
+
+
+class Summary(NamedTuple):
+    """The summary of a finished file."""
+
+    statistics: Statistics
+    channels: dict[int, str]
+    chunks: list[ChunkIndex]
+    metadata: dict[str, int]  # by name, the offset of the record
+
+
+def summary_of(stream: BinaryIO, name: str, size: int) -> Summary | None:
+    """None if the file has no valid summary, as an unfinished one. Raises
+    RecordingError."""
+    # The footer precedes the magic bytes at the end of the file.
+    footer_at = size - len(MAGIC) - HEAD.size - _FOOTER_BYTES
+    stream.seek(size - len(MAGIC))
+    if footer_at < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
+        return None
+    footer = unparsed_at(stream, name, footer_at, size)
+    if footer.opcode != Opcode.FOOTER or footer.end != size - len(MAGIC):
+        return None
+    # It tells where the summary begins.
+    end = parse(footer, name)
+    assert isinstance(end, Footer)
+    offset, crc, records = end.summary_start, 0, list[McapRecord]()
+    if not len(MAGIC) <= offset < footer_at:
+        return None
+    # Read the summary's records up to the footer, with their CRC.
+    while offset < footer_at:
+        unparsed = unparsed_at(stream, name, offset, size)
+        crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
+        if unparsed.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
+            records.append(parse(unparsed, name))
+        offset = unparsed.end
+    statistics = [r for r in records if isinstance(r, Statistics)]
+    if offset != footer_at or not footer_fits(footer, crc) or not statistics:
+        return None
+    return Summary(
+        statistics[0],
+        {r.id: r.topic for r in records if isinstance(r, Channel)},
+        [r for r in records if isinstance(r, ChunkIndex)],
+        {r.name: r.offset for r in records if isinstance(r, MetadataIndex)},
+    )
+
+
+def indexed_times_ns(unparsed: UnparsedRecord) -> tuple[int, NDArray[np.int64]]:
+    """Channel and log times (n,) of the messages that a message index lists."""
+    channel_id, length = _INDEX_HEAD.unpack_from(unparsed.body)
+    entries = np.frombuffer(unparsed.body, dtype="<u8", offset=_INDEX_HEAD.size, count=length // 8)
+    return channel_id, entries[::2].astype(np.int64)
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:

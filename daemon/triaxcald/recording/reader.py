@@ -10,7 +10,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -35,8 +35,10 @@ from triaxcald.recording.mcap_records import (
     chunk_data,
     chunk_records,
     footer_fits,
+    indexed_times_ns,
     parse,
     size_of,
+    summary_of,
     unparsed_at,
     walk,
     written_to,
@@ -57,6 +59,39 @@ JOINED_BYTES = 8 * 2**20
 class TopicMessage(NamedTuple):
     topic: str
     message: Message
+
+
+@dataclass
+class Messages:
+    """Number of messages of a topic, their earliest and latest log time."""
+
+    messages: int
+    start_ns: int
+    end_ns: int
+
+    def add(self, other: Messages) -> None:
+        self.messages += other.messages
+        self.start_ns, self.end_ns = min(self.start_ns, other.start_ns), max(self.end_ns, other.end_ns)
+
+
+@dataclass(frozen=True)
+class Index:
+    """The messages by topic, and the raw records by phase."""
+
+    topics: dict[str, Messages] = field(default_factory=dict)
+    phases: dict[str, schema.PhaseCount] = field(default_factory=dict)
+
+    def add(self, other: Index) -> None:
+        for topic, messages in other.topics.items():
+            if topic in self.topics:
+                self.topics[topic].add(messages)
+            else:
+                self.topics[topic] = messages
+        for phase, count in other.phases.items():
+            if phase in self.phases:
+                self.phases[phase].add(count)
+            else:
+                self.phases[phase] = count
 
 
 class Contents(ABC):
@@ -166,6 +201,11 @@ class Contents(ABC):
         for phase, batch in self.joined_batches():
             digest.update(phase, batch)
         return digest
+
+    def index(self) -> Index | None:
+        """What the file's own index and metadata say of its messages; None where they
+        do not list all of them. Every message then has to be read."""
+        return None
 
     def register_accesses(self) -> Iterator[schema.RegisterAccess]:
         return self._decoded(schema.REGISTERS, schema.decode_register_access)
@@ -329,6 +369,53 @@ class Recording(Contents):
                         yield TopicMessage(found, record)
             self._known[offset] = frozenset(seen), channels
 
+    def index(self) -> Index | None:
+        """Chunks without messages of a topic are not unpacked for it afterwards."""
+        summary = summary_of(self._stream, self.name, self.size) if self.finished else None
+        phases = self._counted_phases()
+        if summary is None or phases is None or [c.chunk_start_offset for c in summary.chunks] != self._chunks:
+            return None
+        topics: dict[str, Messages] = {}
+        alike: dict[frozenset[str], frozenset[str]] = {}
+        known: dict[int, tuple[frozenset[str], dict[int, str]]] = {}
+        for chunk in summary.chunks:
+            here = set[str]()
+            for channel_id, offset in chunk.message_index_offsets.items():
+                unparsed = self.unparsed(offset)
+                topic = summary.channels.get(channel_id)
+                if topic is None or unparsed.opcode != Opcode.MESSAGE_INDEX:
+                    return None
+                said, times_ns = indexed_times_ns(unparsed)
+                if said != channel_id or not len(times_ns):
+                    return None
+                found = Messages(len(times_ns), int(times_ns.min()), int(times_ns.max()))
+                if topic in topics:
+                    topics[topic].add(found)
+                else:
+                    topics[topic] = found
+                here.add(topic)
+            known[chunk.chunk_start_offset] = alike.setdefault(frozenset(here), frozenset(here)), {}
+        if sum(m.messages for m in topics.values()) != summary.statistics.message_count:
+            return None
+        self._topics |= summary.channels
+        self._known |= known
+        return Index(topics, phases)
+
+    def _counted_phases(self) -> dict[str, schema.PhaseCount] | None:
+        """As they were counted when the file was closed; None where they were not, or
+        where records are unconfirmed."""
+        said = self.metadata.get(schema.RAW_RECORD, {})
+        try:
+            phases = {
+                key.removeprefix(schema.PHASE_KEY): schema.PhaseCount.read(text)
+                for key, text in said.items()
+                if key.startswith(schema.PHASE_KEY)
+            }
+        except (ValueError, RecursionError):
+            return None
+        whole = str(sum(count.records for count in phases.values())) == said.get("records")
+        return phases if whole and not self.any_unconfirmed else None
+
     def unparsed_records(self) -> Iterator[UnparsedRecord]:
         """Every record of the file in order, unparsed."""
         return walk(self._stream, self.name, self.size)
@@ -471,6 +558,17 @@ class Series(Contents):
                 if self._alike:
                     self._require_alike(recording, segment)
                 yield from recording.messages(topic)
+
+    def index(self) -> Index | None:
+        if self.any_unconfirmed:
+            return None
+        whole = Index()
+        for segment in self.manifest.segments:
+            with self._opened(segment) as recording:
+                if (found := recording.index()) is None:
+                    return None
+                whole.add(found)
+        return whole
 
     def _require_there(self, segment: Segment) -> None:
         path = self.manifest.path_of(segment)

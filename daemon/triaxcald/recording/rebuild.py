@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-import zlib
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Message, MetadataIndex, Statistics
+from mcap.records import Message
 from mcap.records import Metadata as MetadataRecord
 
 import triaxcal as tc
@@ -29,14 +28,14 @@ from triaxcald.files import unused
 from triaxcald.recording import schema
 from triaxcald.recording.manifest import Manifest, Segment, State, numbered_files, parsed_manifest
 from triaxcald.recording.mcap_records import (
-    HEAD,
     MAGIC,
+    Summary,
     check_magic,
     chunk_data,
     chunk_records,
-    footer_fits,
     parse,
     size_of,
+    summary_of,
     unparsed_at,
     written_to,
 )
@@ -44,7 +43,6 @@ from triaxcald.recording.reader import Recording, digest_of
 from triaxcald.recording.schema import decode_raw
 
 _KEPT = ".replaced"
-_FOOTER_BYTES = 20  # of the body of a footer record
 _DIGITS = re.compile(r"[0-9]{1,18}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -276,15 +274,6 @@ def _place_in(path: Path) -> Place | None:
     return None
 
 
-class _Summary(NamedTuple):
-    """The summary of a finished file."""
-
-    statistics: Statistics
-    channels: dict[int, str]
-    chunks: list[ChunkIndex]
-    metadata: dict[str, int]  # by name, the offset of the record
-
-
 def _by_summary(path: Path, segment: Segment) -> Segment | None:
     """The segment by the summary of its file and the chunks with its first and last raw
     records; reading a week of segments whole would take minutes. None if the whole
@@ -292,7 +281,7 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
     try:
         with td.files.open_file(path) as stream:
             name, size = str(path), size_of(stream)
-            summary = _summary(stream, name, size)
+            summary = summary_of(stream, name, size)
             if summary is None or schema.RAW_RECORD not in summary.metadata or schema.UNCONFIRMED in summary.metadata:
                 return None
             record = parse(unparsed_at(stream, name, summary.metadata[schema.RAW_RECORD], size), name)
@@ -311,42 +300,7 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
     )  # fmt: skip
 
 
-def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
-    """None if the file has no valid summary, as an unfinished one. Raises
-    RecordingError."""
-    # The footer precedes the magic bytes at the end of the file.
-    footer_at = size - len(MAGIC) - HEAD.size - _FOOTER_BYTES
-    stream.seek(size - len(MAGIC))
-    if footer_at < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
-        return None
-    footer = unparsed_at(stream, name, footer_at, size)
-    if footer.opcode != Opcode.FOOTER or footer.end != size - len(MAGIC):
-        return None
-    # It tells where the summary begins.
-    end = parse(footer, name)
-    assert isinstance(end, Footer)
-    offset, crc, records = end.summary_start, 0, list[McapRecord]()
-    if not len(MAGIC) <= offset < footer_at:
-        return None
-    # Read the summary's records up to the footer, with their CRC.
-    while offset < footer_at:
-        unparsed = unparsed_at(stream, name, offset, size)
-        crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
-        if unparsed.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
-            records.append(parse(unparsed, name))
-        offset = unparsed.end
-    statistics = [r for r in records if isinstance(r, Statistics)]
-    if offset != footer_at or not footer_fits(footer, crc) or not statistics:
-        return None
-    return _Summary(
-        statistics[0],
-        {r.id: r.topic for r in records if isinstance(r, Channel)},
-        [r for r in records if isinstance(r, ChunkIndex)],
-        {r.name: r.offset for r in records if isinstance(r, MetadataIndex)},
-    )
-
-
-def _span_ns(stream: BinaryIO, name: str, size: int, summary: _Summary) -> tuple[int, int] | None:
+def _span_ns(stream: BinaryIO, name: str, size: int, summary: Summary) -> tuple[int, int] | None:
     """Host times of the earliest and latest raw record [ns], by the first and the last
     chunk with raw records. Raises RecordingError."""
     raw = {i for i, topic in summary.channels.items() if topic == schema.RAW}

@@ -443,8 +443,7 @@ class _Recoverer:
         if self._sealed is not None:
             at = self._sealed.time_ns
             self._mcap.add_attachment(at, at, self._sealed.name, self._sealed.media_type, self._sealed.data)
-        raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
-        self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        self._mcap.add_metadata(schema.RAW_RECORD, self._digest.record())
         if self._sealed is not None:
             digest = hashlib.sha256(self._sealed.data).hexdigest()
             self._mcap.add_metadata(schema.END_RECORD, {"name": self._sealed.name, "sha256": digest})

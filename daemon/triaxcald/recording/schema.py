@@ -29,6 +29,7 @@ FORMAT = "triaxcal.recording/1"
 FORMAT_RECORD = "recording"  # the metadata record with FORMAT, and with ENDS_WITH in a recording of a run
 ENDS_WITH = "ends_with"  # its key for the name of the document that ends a complete recording
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
+PHASE_KEY = "phase "  # prefix of its keys with the counts of a phase, which follows
 END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
 SENT = "sent"  # the kind of the event about a frame that a sequence of the profile sent
 IMPORTED = "imported"  # the kind of the event about the log that a recording was imported from
@@ -252,6 +253,34 @@ def cut(batch: td.RawBatch, records: int = MAX_RECORDS) -> Iterator[td.RawBatch]
         yield batch.part(start, min(start + records, len(batch)))
 
 
+@dataclass
+class PhaseCount:
+    """Raw records of a phase, the bytes of their payloads, and the earliest and latest
+    host time."""
+
+    records: int
+    bytes: int
+    start_ns: int
+    end_ns: int
+
+    @classmethod
+    def of(cls, batch: td.RawBatch) -> PhaseCount:
+        """``batch`` is not empty."""
+        return cls(len(batch), len(batch.payload), int(batch.time_ns.min()), int(batch.time_ns.max()))
+
+    @classmethod
+    def read(cls, text: str) -> PhaseCount:
+        """As `RawDigest.record` writes it. Raises ValueError."""
+        counts = json.loads(text)
+        if not isinstance(counts, list) or len(counts) != 4 or not all(type(n) is int for n in counts):
+            raise ValueError("not the counts of a phase")
+        return cls(*counts)
+
+    def add(self, other: PhaseCount) -> None:
+        self.records, self.bytes = self.records + other.records, self.bytes + other.bytes
+        self.start_ns, self.end_ns = min(self.start_ns, other.start_ns), max(self.end_ns, other.end_ns)
+
+
 class RawDigest:
     """SHA-256 over raw records. It does not depend on how they are divided into
     batches, nor on how the phases are interleaved.
@@ -267,6 +296,7 @@ class RawDigest:
     def __init__(self, ends_with: str = "") -> None:
         self.records = 0
         self.ends_with = ends_with
+        self.phases: dict[str, PhaseCount] = {}
         self._phases: dict[str, tuple[hashlib._Hash, hashlib._Hash]] = {}
 
     def update(self, phase: str, batch: td.RawBatch) -> None:
@@ -279,6 +309,17 @@ class RawDigest:
         columns.update(table.tobytes())
         payloads.update(batch.payload)
         self.records += len(batch)
+        count = PhaseCount.of(batch)
+        if phase in self.phases:
+            self.phases[phase].add(count)
+        else:
+            self.phases[phase] = count
+
+    def record(self) -> dict[str, str]:
+        """The metadata record: number and digest of the records, and the counts of each
+        phase, which `log info` takes from there."""
+        counts = {PHASE_KEY + phase: json.dumps(list(vars(c).values())) for phase, c in self.phases.items()}
+        return {"records": str(self.records), "sha256": self.hexdigest(), **counts}
 
     def hexdigest(self) -> str:
         whole = hashlib.sha256(self.ends_with.encode())

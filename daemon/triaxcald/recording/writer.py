@@ -192,8 +192,7 @@ class RecordingFile:
         closed."""
         if self._begun_ns is not None:
             self._tell_begun(self._begun_ns)
-        raw = {"records": str(self.digest.records), "sha256": self.digest.hexdigest()}
-        self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        self._mcap.add_metadata(schema.RAW_RECORD, self.digest.record())
         if self._end:
             self._mcap.add_metadata(schema.END_RECORD, self._end)
         self._mcap.finish()  # type: ignore[no-untyped-call]

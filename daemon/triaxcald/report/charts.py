@@ -8,18 +8,23 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib
 import matplotlib.style
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_mixed import MixedModeRenderer
+from matplotlib.backends.backend_svg import FigureCanvasSVG, RendererSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Circle
+from matplotlib.textpath import text_to_path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
@@ -81,9 +86,62 @@ def draw(name: str, alt: str, size_in: tuple[float, float], paint: Callable[[Fig
     with matplotlib.style.context(["default", {**_STYLE, "svg.hashsalt": name}]):
         figure = Figure(figsize=size_in, layout="constrained")
         paint(figure)
-        sheet = io.StringIO()
-        figure.savefig(sheet, format="svg", metadata=_NO_METADATA)
-    return _inline(sheet.getvalue(), name, alt)
+        svg = _svg(figure)
+    return _inline(svg, name, alt)
+
+
+_POINTS = 72
+"""Units of an SVG drawing an inch."""
+
+
+def _svg(figure: Figure) -> str:
+    """The bytes of `Figure.savefig`, which draws everything once more only to place
+    the axes, and measures each text for both anew."""
+    sheet, dots, (width, height) = io.StringIO(), figure.dpi, figure.get_size_inches()
+
+    def renderer(out: io.StringIO) -> Any:
+        make: Any = _Renderer
+        return make(width * _POINTS, height * _POINTS, out, image_dpi=dots, metadata=_NO_METADATA)
+
+    _Canvas(figure).measures = renderer(io.StringIO())
+    figure.set_dpi(_POINTS)
+    # Place the axes, then draw them where they are.
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine("none")
+    both: Any = MixedModeRenderer
+    page = both(figure, width, height, dots, renderer(sheet))
+    figure.draw(page)
+    page.finalize()
+    return sheet.getvalue()
+
+
+class _Canvas(FigureCanvasSVG):
+    """With the renderer by which the layout measures."""
+
+    measures: RendererSVG
+
+    def get_renderer(self) -> RendererSVG:
+        return self.measures
+
+
+class _Renderer(RendererSVG):
+    """Measures a text once for all pictures."""
+
+    def get_text_width_height_descent(
+        self, s: str, prop: FontProperties, ismath: bool | Literal["TeX"]
+    ) -> tuple[float, float, float]:
+        return _measured(s, prop, ismath) if ismath else _extent(s, prop)
+
+
+@lru_cache(maxsize=4096)
+def _extent(words: str, font: FontProperties) -> tuple[float, float, float]:
+    """Width, height and descent; matplotlib asks with a copy of the font."""
+    return _measured(words, font, False)
+
+
+_measured: Callable[..., tuple[float, float, float]] = text_to_path.get_text_width_height_descent
 
 
 def hang_grid(axes: Axes, axis: Literal["x", "y"] = "y") -> None:

@@ -219,6 +219,11 @@ ROWS = [
     Row("certificate taken out", lambda f: f.drop(CERTIFICATE), f"{CERTIFICATE}: {MISSING}"),
     Row("raw digest zeroed", lambda f: f.metadata("raw").metadata.update(sha256="0" * 64), "raw: sha256: stored "),
     Row("raw count changed", lambda f: f.metadata("raw").metadata.update(records="7"), 'raw: records: stored "7"'),
+    Row(
+        "raw count of a phase changed",
+        lambda f: f.metadata("raw").metadata.update({"phase calibration": "[1, 2, 3, 4]"}),
+        "raw: phase calibration: stored ",
+    ),
     Row("raw metadata taken out", lambda f: f.drop("raw"), f"raw: {MISSING}"),
     Row("raw log times shifted", lambda f: f.each(RAW, at(SECOND_NS)), f"{RAW}: sha256: the outcome lists "),
     Row("event times shifted", lambda f: f.each(EVENTS, at(SECOND_NS)), f"{EVENTS}: 2 records with other times"),

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import RecordingError
+from triaxcald.recording import reader
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
+from triaxcald.recording.schema import PHASE_KEY, PhaseCount
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.tables.native_csv import Rows, read_csv, write_csv
 
@@ -103,3 +105,65 @@ def test_blocks_of_different_channels_do_not_mix() -> None:
     other = SampleBlock(np.array([2]), np.array([1]), np.zeros((1, 3)), {})
     with pytest.raises(RecordingError, match=r"channels \[\] after sample 1, expected \['a'\]"):
         write_csv(io.StringIO(), map(Rows.of, [one, other]))
+
+
+def _long_from(monkeypatch: pytest.MonkeyPatch, records: int) -> None:
+    monkeypatch.setattr("triaxcald.recording.info.COUNTED_MOST", records)
+
+
+def test_a_long_recording_is_described_by_its_index_as_by_its_records(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = describe(recording)
+    _long_from(monkeypatch, 100)
+    by_index, again = describe(recording), describe(recording, count=True)
+    assert (counted["counted"], by_index["counted"]) == (True, False)
+    assert again == counted
+    assert {**by_index, "counted": True} == counted
+    assert list(by_index["topics"]) == list(counted["topics"])
+
+
+def test_the_index_unpacks_no_chunk_but_those_with_events(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unpacked: list[int] = []
+    real = reader.chunk_data
+    monkeypatch.setattr(reader, "chunk_data", lambda unparsed, name: unpacked.append(1) or real(unparsed, name))
+    counted = describe(recording)
+    of_all, unpacked[:] = len(unpacked), []
+    _long_from(monkeypatch, 100)
+    assert describe(recording)["events"] == counted["events"]
+    assert 0 < len(unpacked) < of_all
+
+
+def test_a_long_recording_that_was_cut_short_is_counted(
+    tmp_path: Path,
+    new_writer: Callable[..., RecordingWriter],
+    batch_of: Callable[..., RawBatch],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _long_from(monkeypatch, 5)
+    writer = new_writer()
+    writer.raw("calibration", batch_of(0, 30))
+    writer.drain()
+    found = describe(tmp_path / "rec.mcap")
+    assert (found["finished"], found["counted"], found["raw"]["calibration"]["records"]) == (False, True, 30)
+
+
+@pytest.mark.parametrize("said", ["[1, 2, 3]", "[1, 2, 3, 4, 5]", "{}", "[1, 2, 3, true]", "x", '[1, 2, 3, "4"]'])
+def test_what_is_no_count_of_a_phase_is_not_taken_for_one(said: str) -> None:
+    with pytest.raises(ValueError):
+        PhaseCount.read(said)
+
+
+def test_records_that_the_metadata_do_not_count_are_counted(
+    recording: Path, rewrite: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a recording of an earlier version."""
+    counted = describe(recording)
+    _long_from(monkeypatch, 100)
+
+    def bare(name: str, record: dict[str, str]) -> dict[str, str]:
+        return {k: v for k, v in record.items() if not k.startswith(PHASE_KEY)}
+
+    found = describe(rewrite(recording, metadata=bare))
+    assert found["counted"]
+    assert found["raw"] == counted["raw"]
