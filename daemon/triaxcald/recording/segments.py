@@ -23,7 +23,17 @@ from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.manifest import SEGMENT_BYTES as SEGMENT_BYTES
 from triaxcald.recording.manifest import SEGMENT_S as SEGMENT_S
-from triaxcald.recording.manifest import Document, Manifest, Retention, Segment, Surplus, delete, manifest_path, surplus
+from triaxcald.recording.manifest import (
+    Document,
+    Manifest,
+    Retention,
+    Segment,
+    Sign,
+    Surplus,
+    delete,
+    manifest_path,
+    surplus,
+)
 from triaxcald.recording.reader import digest_of
 from triaxcald.recording.rebuild import open_manifest, with_last_on_disk
 from triaxcald.recording.writer import Head, RecordingFile, RecordingWriter, ended_because
@@ -295,7 +305,7 @@ class SegmentedWriter(RecordingWriter):
         """Document that cannot be read; it keeps segments that would be deleted."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
-    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
+    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes], sign: Sign | None = None) -> None:
         raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
 
     @property
