@@ -32,6 +32,8 @@ from triaxcald.audit.results import (
     report_of,
     sealed_later,
 )
+from triaxcald.audit.signature import Policy, Signature, State
+from triaxcald.audit.signature import check as check_signature
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
@@ -97,6 +99,7 @@ class Audit:
     furthest: tuple[float, str] | None = None
     """Of another version's calibration: the largest difference of a coefficient
     in its standard error, and which."""
+    signature: Signature = field(default_factory=lambda: Signature(State.UNSIGNED))
 
     @property
     def result(self) -> Result:
@@ -105,9 +108,10 @@ class Audit:
         return Result.SAME_FIGURES if self.agreement.figures else Result.SAME_BYTES
 
 
-def audit(path: Path, *, compute: Compute = compute) -> Audit:
-    """Raises RecordingError where the file cannot be read, or holds no result.
-    ``compute`` makes the results again."""
+def audit(path: Path, *, compute: Compute = compute, policy: Policy = Policy()) -> Audit:  # noqa: B008 - frozen
+    """Raises RecordingError where the file cannot be read, or holds no result;
+    InputError for an unusable trust file. ``compute`` makes the results again,
+    ``policy`` is what is asked of signatures."""
     if is_manifest(path):
         raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
     with Recording.open(path) as recording:
@@ -118,7 +122,7 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
             )
         if recording.ends_with != FORMAT:
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
-        return _Audit(path, recording, compute).run()
+        return _Audit(path, recording, compute, policy).run()
 
 
 COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
@@ -126,8 +130,8 @@ COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
 
 
 class _Audit:
-    def __init__(self, path: Path, recording: Recording, compute: Compute) -> None:
-        self._path, self._recording, self._compute = path, recording, compute
+    def __init__(self, path: Path, recording: Recording, compute: Compute, policy: Policy) -> None:
+        self._path, self._recording, self._compute, self._policy = path, recording, compute, policy
         self._held = {name: recording.attachments[name] for name in recording.attachments if "/" not in name}
         self._checked: list[str] = []
         self._differences: list[Difference] = []
@@ -153,6 +157,8 @@ class _Audit:
         self._differences += contents.faults(found)
         if self._outcome:
             self._differences += contents.against_inventory(found, self._outcome)
+        signature, unproven = check_signature(self._path, self._held, found, self._policy)
+        self._differences += unproven
         differing, not_beside = beside(self._path, self._held)
         self._differences += differing
         verdict = self._outcome.get("verdict")
@@ -166,6 +172,7 @@ class _Audit:
             self._computed_on(),
             self._made_by,
             self._furthest,
+            signature,
         )
 
     @property

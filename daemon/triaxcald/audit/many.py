@@ -10,6 +10,7 @@ from pathlib import Path
 import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.audit.conduct import Audit, audit
+from triaxcald.audit.signature import Policy
 from triaxcald.errors import DONE, OUTSIDE, SEVEREST, DaemonError, InputError, exit_code_of
 from triaxcald.memory import out_of_memory, ran_out_of_memory
 
@@ -38,14 +39,19 @@ def to_audit(asked: Sequence[Path]) -> list[Path | Audited]:
     return list(found.values())
 
 
-def audit_each(of: Iterable[Path | Audited], begins: Callable[[Path], None] = lambda path: None) -> Iterator[Audited]:
-    """Audit what `to_audit` found; ``begins`` is called before each recording."""
+def audit_each(
+    of: Iterable[Path | Audited],
+    begins: Callable[[Path], None] = lambda path: None,
+    policy: Policy = Policy(),  # noqa: B008 - frozen
+) -> Iterator[Audited]:
+    """Audit what `to_audit` found; ``begins`` is called before each recording, and
+    ``policy`` is what is asked of signatures."""
     for one in of:
         if isinstance(one, Audited):
             yield one
         else:
             begins(one)
-            yield _audited(one)
+            yield _audited(one, policy)
 
 
 def worst(of: Iterable[Audited]) -> int:
@@ -53,9 +59,9 @@ def worst(of: Iterable[Audited]) -> int:
     return next((code for code in SEVEREST if code in codes), DONE)
 
 
-def _audited(path: Path) -> Audited:
+def _audited(path: Path, policy: Policy) -> Audited:
     try:
-        found = audit(path)
+        found = audit(path, policy=policy)
     except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         return Audited(str(path), None, str(e), exit_code_of(e))
     except Exception as e:

@@ -18,7 +18,7 @@ from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.cli.console import at, emit, say, show
 from triaxcald.cli.syntax import writable
 from triaxcald.decoded import DecodedStream, beside_samples
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, severest
 from triaxcald.files import is_stream, new_file, require_new, require_recording
 from triaxcald.imports.importing import left_out, remarks, summary
 from triaxcald.imports.opening import DRIVERS, opened_log
@@ -30,12 +30,14 @@ from triaxcald.tables.native_csv import Rows, write_csv
 
 
 def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import Audited, audit_each, text, to_audit, worst  # the whole line, which no `log` needs
+    from triaxcald.audit import Audited, Policy, audit_chain, audit_each, text, to_audit, worst  # which no `log` needs
 
+    policy = Policy(a.trust, a.allow_unsigned)
+    folders = _chains(a)
     asked = to_audit(a.recordings)
     audited: list[Audited] = []
     with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
-        for one in audit_each(asked, lambda path: at(f"auditing {path}")):
+        for one in audit_each(asked, lambda path: at(f"auditing {path}"), policy):
             audited.append(one)
             if one.audit is None:
                 say(f"triaxcal: {one.error}")
@@ -45,13 +47,34 @@ def audit_command(a: argparse.Namespace) -> int:
                     show(f"  {line}")
                 for line in text.notes(one.audit.notes):
                     show(f"  note: {line}")
+                if (signed := text.signature(one.audit.signature)) is not None:
+                    show(f"  {signed}")
                 sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
+    chains = [audit_chain(folder, policy, a.head) for folder in folders]
     if a.json:
         emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
-              "summary": text.counts(audited)})  # fmt: skip
-    elif len(audited) > 1:
-        show(text.summary(audited))
-    return worst(audited)
+              "summary": text.counts(audited),
+              **({"chains": [text.chain_document(x) for x in chains]} if a.chain else {})})  # fmt: skip
+    else:
+        if len(audited) > 1:
+            show(text.summary(audited))
+        for line in chain(*map(text.chained, chains)):
+            show(line)
+    return severest([worst(audited), *(found.exit_code for found in chains)])
+
+
+def _chains(a: argparse.Namespace) -> list[Path]:
+    """Folders whose chains are asked for. Raises InputError."""
+    if a.head is not None and not a.chain:
+        raise InputError("--head: only --chain compares it")
+    if not a.chain:
+        return []
+    for given in a.recordings:
+        if not given.is_dir():
+            raise InputError(f"{given}: --chain takes folders of stations, expected a folder")
+    if a.head is not None and len(a.recordings) > 1:
+        raise InputError("--head: the head of one folder, and several are given")
+    return list(a.recordings)
 
 
 def info_command(a: argparse.Namespace) -> int:

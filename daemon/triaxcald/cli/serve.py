@@ -56,6 +56,9 @@ def serve_command(a: argparse.Namespace) -> int:
         from triaxcald.run.golden_unit import golden_calibration
 
         golden_calibration(station)
+    from triaxcald.signing.station import signing_of
+
+    signing_of(station)
     from triaxcald.service.gate import require_safe
     from triaxcald.service.server import Address, serve
 

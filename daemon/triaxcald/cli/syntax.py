@@ -287,6 +287,7 @@ def register(commands: Any) -> None:
     _planning(commands)
     _devices(commands)
     _access(commands)
+    _keys(commands)
     _audits(commands)
 
 
@@ -784,6 +785,56 @@ def _add_database(p: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def _keys(commands: Any) -> None:
+    keys = commands.add_parser("keys", help="keys by which a station signs its recordings")
+    parts = keys.add_subparsers(dest="part", required=True, metavar="new|list|trust|revoke")
+    p = _command(
+        parts, "new", "keys:new_command", "make a key, by which the station signs from then on",
+        "The passphrase is that of TRIAXCAL_KEY_PASSPHRASE or of a file.", "keys new line-1 --folder station",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME", help="1 to 64 of A–Z a–z 0–9 . _ -")
+    p.add_argument("--passphrase-file", metavar="FILE", type=Path, help="its first line is the passphrase")
+    p.add_argument("--no-passphrase", action="store_true", help="whoever can read the file can sign; its mode is 0600")
+    p.add_argument("--pkcs11", metavar="MODULE", type=Path, help="make it in a device, by this library")
+    p.add_argument("--token", metavar="LABEL", help="which token of the device; the passphrase is its PIN")
+    _add_key_folder(p)
+    p = _command(parts, "list", "keys:list_command", "show keys, and which are trusted", "", "keys list")
+    _add_key_folder(p)
+    p = _command(
+        parts, "trust", "keys:trust_command", "trust a key, or a time-stamping authority",
+        "The first key makes the trust file: recordings from then on have to be signed.", "keys trust line-1",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME")
+    p.add_argument(
+        "--public", metavar="FILE", type=Path, help="public key in PEM; default: NAME.pub in the folder keys"
+    )
+    p.add_argument("--authority", metavar="FILE", type=Path, help="root certificate in PEM of an authority (RFC 3161)")
+    _add_key_folder(p)
+    p = _command(
+        parts, "revoke", "keys:revoke_command", "trust nothing that a key signs from now on", "",
+        "keys revoke line-1 --reason 'the computer was stolen'",
+    )  # fmt: skip
+    p.add_argument("name", metavar="NAME")
+    p.add_argument("--reason", metavar="TEXT", required=True)
+    p.add_argument(
+        "--retired", action="store_true",
+        help="nobody else had it: what it says to have signed before stays trusted; without this, only what a time "
+        "stamp shows",
+    )  # fmt: skip
+    _add_key_folder(p)
+
+
+def _add_key_folder(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--folder",
+        metavar="DIR",
+        type=Path,
+        default=Path(),
+        help="of the station, with keys and trust.toml; default: .",
+    )
+    add_json(p)
+
+
 def _audits(commands: Any) -> None:
     p = _command(
         commands, "audit", "recordings:audit_command", "recompute results from recordings and compare",
@@ -791,6 +842,13 @@ def _audits(commands: Any) -> None:
         computes=True,
     )  # fmt: skip
     p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
+    p.add_argument(
+        "--trust", metavar="FILE", type=Path,
+        help="with the trusted keys; default: trust.toml in the recording's folder or above it",
+    )  # fmt: skip
+    p.add_argument("--allow-unsigned", action="store_true", help="unsigned recordings, and keys unknown, may pass")
+    p.add_argument("--chain", action="store_true", help="look for recordings that were removed or inserted, too")
+    p.add_argument("--head", metavar="DIGEST", help="with --chain: of an entry that it had, by an earlier audit")
     add_json(p)
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
     parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
