@@ -229,7 +229,7 @@ class _ChainAudit:
         for entry in entries:
             if entry.kind is not EntryKind.RECORDING:
                 continue
-            found = there.get(entry.digest, [])
+            found = sorted(there.get(entry.digest, []), key=lambda one: one.path.name != one.name)
             if not found and entry.digest not in tombstones:
                 self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
             for other in found[1:]:

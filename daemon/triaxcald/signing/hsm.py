@@ -20,16 +20,18 @@ def open_key(module: Path, token: str, label: str, pin: bytes | None) -> Signing
     Raises InputError."""
     with _errors(module, token):
         session = _session(module, token, pin, label, rw=False)
-        from pkcs11 import Attribute, KeyType, Mechanism, ObjectClass
+        from pkcs11 import Attribute, KeyType, Mechanism, ObjectClass, PKCS11Error
 
-        private = session.get_key(object_class=ObjectClass.PRIVATE_KEY, key_type=KeyType.EC_EDWARDS, label=label)
-        public = session.get_key(object_class=ObjectClass.PUBLIC_KEY, key_type=KeyType.EC_EDWARDS, label=label)
-        point = bytes(public[Attribute.EC_POINT])
+        try:
+            private = session.get_key(object_class=ObjectClass.PRIVATE_KEY, key_type=KeyType.EC_EDWARDS, label=label)
+            public = session.get_key(object_class=ObjectClass.PUBLIC_KEY, key_type=KeyType.EC_EDWARDS, label=label)
+            point = bytes(public[Attribute.EC_POINT])
+        except PKCS11Error:
+            session.close()
+            raise
     one_at_a_time = threading.Lock()  # a session is of one thread
 
     def sign(message: bytes) -> bytes:
-        from pkcs11 import PKCS11Error
-
         with one_at_a_time:
             try:
                 return bytes(private.sign(message, mechanism=Mechanism.EDDSA))
@@ -46,14 +48,18 @@ def new_key(module: Path, token: str, label: str, pin: bytes | None) -> bytes:
         session = _session(module, token, pin, label, rw=True)
         from pkcs11 import Attribute, KeyType, Mechanism
 
-        if any(session.get_objects({Attribute.LABEL: label})):
-            raise InputError(f"token {token}: has a key {label} already; a key is never overwritten")
-        curve = session.create_domain_parameters(KeyType.EC_EDWARDS, {Attribute.EC_PARAMS: _EDWARDS25519}, local=True)
-        public, _ = curve.generate_keypair(
-            mechanism=Mechanism.EC_EDWARDS_KEY_PAIR_GEN, label=label, id=label.encode(), store=True
-        )
-        point = bytes(public[Attribute.EC_POINT])
-        session.close()
+        try:
+            if any(session.get_objects({Attribute.LABEL: label})):
+                raise InputError(f"token {token}: has a key {label} already; a key is never overwritten")
+            curve = session.create_domain_parameters(
+                KeyType.EC_EDWARDS, {Attribute.EC_PARAMS: _EDWARDS25519}, local=True
+            )
+            public, _ = curve.generate_keypair(
+                mechanism=Mechanism.EC_EDWARDS_KEY_PAIR_GEN, label=label, id=label.encode(), store=True
+            )
+            point = bytes(public[Attribute.EC_POINT])
+        finally:
+            session.close()
     return point[-KEY_BYTES:]
 
 
@@ -62,7 +68,11 @@ def _session(module: Path, token: str, pin: bytes | None, label: str, *, rw: boo
         raise InputError(f"token {token}: key {label} needs a PIN: {PASSPHRASE} in the environment, or a file with it")
     import pkcs11
 
-    return pkcs11.lib(str(module)).get_token(token_label=token).open(rw=rw, user_pin=pin.decode("utf-8", "replace"))
+    found = pkcs11.lib(str(module)).get_token(token_label=token)
+    try:
+        return found.open(rw=rw, user_pin=pin.decode("utf-8", "replace"))
+    except pkcs11.UserAlreadyLoggedIn:  # a login is of the whole process
+        return found.open(rw=rw)
 
 
 @contextmanager
