@@ -67,9 +67,8 @@ class StationSigning:
                 open_chain.forget()
 
     def bury(self, of: str, recording: str, reason: str) -> None:
-        """Sign that a recording is about to be deleted, and why; once, if it is asked
-        for again. ``of`` is its digest as `Tombstone` has it. Raises NotSigned,
-        OSError."""
+        """Sign that a recording is about to be deleted, and why. ``of`` is its digest
+        as `Tombstone` has it. Raises NotSigned, OSError."""
         with self._next() as (open_chain, claims):
             document = {**chain.tombstone_document(of, recording, reason), **claims_document(claims)}
             self._append(open_chain, self._entry(EntryKind.TOMBSTONE, claims, document, recording))

@@ -30,7 +30,7 @@ from triaxcald.signing.station import StationSigning
 from triaxcald.utc import iso_time
 
 SECOND_NS = 1_000_000_000
-T0_NS = 1_800_000_000 * SECOND_NS  # in January 2027
+T0_NS = 1_700_000_000 * SECOND_NS  # in November 2023
 
 
 def when(time_ns: int) -> str:

@@ -444,3 +444,53 @@ def test_a_revoked_key_keeps_its_chain_but_not_its_trust(line: Line) -> None:
     found = kinds(line)
     assert set(found) == {Kind.REVOKED, Kind.INSERTED}  # the start too: nothing says which recordings are earlier
     assert looked_at(line.made[1], Policy())[0].state is State.REVOKED
+
+
+def test_retention_signs_a_tombstone_for_each_segment_that_it_deletes(line: Line) -> None:
+    """A segment for which none can be signed stays."""
+    from tests.daemon.signing.line import batch
+    from triaxcald.recording.manifest import Retention
+    from triaxcald.recording.segments import SegmentedWriter
+
+    def written(bury: Any) -> SegmentedWriter:
+        writer = SegmentedWriter(
+            line.folder / "log.segments.json", metadata={"bus": {}}, preview_channels=None, time_s=50.0,
+            retention=Retention(keep_s=100.0), bury=bury, clock_ns=lambda: line.now_ns, steady_ns=lambda: line.now_ns,
+        )  # fmt: skip
+        for i in range(5):
+            writer.raw("bus/0", batch(line.now_ns, i))
+            line.now_ns += 60 * SECOND_NS
+            writer.drain()
+        writer.close()
+        return writer
+
+    def cannot(*_: Any) -> None:
+        raise NotSigned("no key")
+
+    assert written(cannot).deleted == []
+    deleted = written(line.signing.bury).deleted
+    assert len(deleted) >= 3
+    found = audit_chain(line.folder)
+    assert (found.differences, found.tombstones) == ((), len(deleted))
+    said = [chain.said_in(chain.entry_of(text)) for text in chain.read_lines(line.folder / chain.NAME)[5:]]
+    assert [(s.of, s.recording, s.reason) for s in said if isinstance(s, chain.Tombstone)] == [
+        (one.segment.sha256, one.segment.file, "age") for one in deleted
+    ]
+
+
+def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, tmp_path: Path) -> None:
+    from tests.conftest import Workshop
+    from triaxcald.cli.commands import main
+
+    station = Workshop(line.folder).station({"bus": {"host": "127.0.0.1", "port": 1}})
+    delete = ["log", "delete", "--station", str(station), "--reason", "two years old"]
+    assert main([*delete, str(line.made[2])]) == 2  # without a key
+    assert key.folder is not None
+    shutil.copy(key.folder / "line-1.key", line.folder / "keys")
+    assert main([*delete, str(tmp_path / "elsewhere.mcap"), str(line.made[2])]) == 2
+    assert line.made[2].exists()
+    assert main([*delete, str(line.made[2])]) == 0
+    assert not list(line.folder.glob("unit-0002.m*"))
+    assert line.made[2].with_suffix(f".{ATTACHMENT}").exists()
+    found = audit_chain(line.folder)
+    assert (found.differences, found.tombstones) == ((), 1)
