@@ -32,15 +32,15 @@ def _folders(a: argparse.Namespace) -> tuple[Path, Path]:
 def new_command(a: argparse.Namespace) -> int:
     require_name(a.name)
     _, keys = _folders(a)
-    if (a.pkcs11 is None) != (a.token is None):
-        raise InputError("--pkcs11, --token: give both, or neither")
-    if a.no_passphrase and (a.passphrase_file is not None or a.pkcs11 is not None):
+    if (a.module is None) != (a.token is None):
+        raise InputError("--module, --token: give both, or neither")
+    if a.no_passphrase and (a.passphrase_file is not None or a.module is not None):
         raise InputError("--no-passphrase: give one way alone")
     passphrase = None if a.no_passphrase else passphrase_of(a.passphrase_file)
     if passphrase is None and not a.no_passphrase:
         raise InputError(f"key {a.name}: give {PASSPHRASE}, --passphrase-file or --no-passphrase")
-    if a.pkcs11 is not None:
-        public = hsm.new_key(a.pkcs11, a.token, a.name, passphrase)
+    if a.module is not None:
+        public = hsm.new_key(a.module, a.token, a.name, passphrase)
         write_public(keys, a.name, public)
     else:
         public = new_key(keys, a.name, passphrase).public

@@ -795,7 +795,7 @@ def _keys(commands: Any) -> None:
     p.add_argument("name", metavar="NAME", help="1 to 64 of A–Z a–z 0–9 . _ -")
     p.add_argument("--passphrase-file", metavar="FILE", type=Path, help="its first line is the passphrase")
     p.add_argument("--no-passphrase", action="store_true", help="whoever can read the file can sign; its mode is 0600")
-    p.add_argument("--pkcs11", metavar="MODULE", type=Path, help="make it in a device, by this library")
+    p.add_argument("--module", metavar="MODULE", type=Path, help="make it in a device, by this library (PKCS #11)")
     p.add_argument("--token", metavar="LABEL", help="which token of the device; the passphrase is its PIN")
     _add_key_folder(p)
     p = _command(parts, "list", "keys:list_command", "show keys, and which are trusted", "", "keys list")

@@ -225,7 +225,7 @@ def test_a_key_in_a_token_signs_and_never_leaves_it(folder: Path, token: Path, m
     from triaxcald.signing.hsm import open_key
 
     monkeypatch.setenv(PASSPHRASE, "1234")
-    made = ["keys", "new", "line-1", "--pkcs11", str(token), "--token", "station"]
+    made = ["keys", "new", "line-1", "--module", str(token), "--token", "station"]
     assert main(made) == 0
     assert main(made) == 2  # never over another
     assert not (folder / "keys" / "line-1.key").exists()

@@ -163,7 +163,7 @@ def test_a_station_signs_by_a_key_in_a_token(
 ) -> None:
     monkeypatch.setenv(PASSPHRASE, "1234")
     folder = str(workshop.folder)
-    assert main(["keys", "new", "station-3", "--pkcs11", str(token), "--token", "station", "--folder", folder]) == 0
+    assert main(["keys", "new", "station-3", "--module", str(token), "--token", "station", "--folder", folder]) == 0
     assert main(["keys", "trust", "station-3", "--folder", folder]) == 0
     found = signing_of(station(key="station-3", pkcs11={"module": str(token), "token": "station"}))
     assert found is not None
