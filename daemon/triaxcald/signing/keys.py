@@ -98,7 +98,7 @@ class SigningKey:
     public: bytes
     sign: Callable[[bytes], bytes]
     folder: Path | None = None
-    """Folder of its file; None for a key in a token."""
+    """Folder of its file, in which it remembers its chains; None without one."""
 
     @property
     def id(self) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -56,6 +55,9 @@ def require_installed() -> None:
 def stamp(url: str, message: bytes) -> bytes | None:
     """The authority's answer, in DER; None where none can be had. Raises nothing: the
     signature holds without it, and the audit says that the stamp is missing."""
+    import http.client
+    import urllib.request
+
     from rfc3161_client import TimestampRequestBuilder, VerificationError
 
     with _lock:
@@ -73,7 +75,7 @@ def stamp(url: str, message: bytes) -> bytes | None:
         found = _decoded(data)
         if found.tst_info.nonce != request.nonce or not _is_of(found, message):
             raise VerificationError("an answer to something else")
-    except (OSError, ValueError, VerificationError, urllib.error.URLError):
+    except (OSError, ValueError, VerificationError, http.client.HTTPException):
         with _lock:
             _down[url] = time.monotonic() + DOWN_S
         return None
@@ -114,8 +116,6 @@ def _decoded(data: bytes):  # type: ignore[no-untyped-def]
 
 def _is_of(found, message: bytes) -> bool:  # type: ignore[no-untyped-def]
     """Whether the answer is about the message, by its digest."""
-    import hashlib
-
     imprint = found.tst_info.message_imprint
     digest = {32: hashlib.sha256, 48: hashlib.sha384, 64: hashlib.sha512}.get(len(imprint.message))
     return digest is not None and digest(message).digest() == imprint.message

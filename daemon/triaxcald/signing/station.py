@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -208,7 +208,8 @@ def _of_token(station: Station, sign: Sign) -> SigningKey:
     pin, module = _passphrase(station, sign), Path(sign.pkcs11.module)
     opened = (str(module), sign.pkcs11.token, sign.key, hashlib.sha256(pin or b"").hexdigest())
     if opened not in _opened:
-        _opened[opened] = hsm.open_key(module, sign.pkcs11.token, sign.key, pin)
+        remembers = next((folder for folder in key_folders(station) if folder.is_dir()), None)
+        _opened[opened] = replace(hsm.open_key(module, sign.pkcs11.token, sign.key, pin), folder=remembers)
     return _opened[opened]
 
 
