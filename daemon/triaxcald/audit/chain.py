@@ -17,7 +17,7 @@ from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE
 from triaxcald.signing import chain
-from triaxcald.signing.chain import Entry, EntryKind, Memory, Start, Tombstone
+from triaxcald.signing.chain import Entry, EntryKind, Start, Tombstone
 from triaxcald.signing.envelope import MANIFEST_TYPE, Envelope, NotAnEnvelope, parse_envelope, payload_of
 from triaxcald.signing.keys import FOLDER
 from triaxcald.signing.manifest import Claims, claims_of
@@ -75,6 +75,13 @@ def audit_chain(folder: Path, policy: Policy = Policy(), head: str | None = None
     return _ChainAudit(folder, policy.trust_of(folder / "recording"), policy, head).run()
 
 
+def chains_in(folder: Path) -> list[Path]:
+    """The folder with its own chain, or those below it that have one; the folder itself
+    where there is none."""
+    below = sorted(path.parent for path in folder.rglob(chain.NAME))
+    return below or [folder]
+
+
 @dataclass
 class _ChainAudit:
     folder: Path
@@ -120,7 +127,7 @@ class _ChainAudit:
         """Signed recordings, and the outcomes of the others. One that cannot be read is
         left to its own audit."""
         signed, unsigned = [], []
-        for path in sorted(self.folder.rglob("*.mcap")):
+        for path in self._below("*.mcap"):
             try:
                 with Recording.open(path) as recording:
                     if recording.ends_with != FORMAT:
@@ -143,6 +150,11 @@ class _ChainAudit:
             name = told if isinstance(told, str) else path.name
             signed.append(_Signed(path, envelope, claims, name, moment(said.get("ended")), mended))
         return signed, unsigned
+
+    def _below(self, pattern: str) -> list[Path]:
+        """Files in the folder, but for those of folders with a chain of their own."""
+        others = {path.parent for path in self.folder.rglob(chain.NAME)} - {self.folder}
+        return [path for path in sorted(self.folder.rglob(pattern)) if not others & set(path.parents)]
 
     def _entries(self, path: Path) -> list[Entry]:
         """The lines of the chain up to the first that is none."""
@@ -266,7 +278,7 @@ class _ChainAudit:
     def _sidecars(self, tombstones: dict[str, Tombstone]) -> None:
         """A signature beside no recording, which only a recording that was removed
         leaves."""
-        for path in self.folder.rglob(f"*.{SIGNATURE_FILE}"):
+        for path in self._below(f"*.{SIGNATURE_FILE}"):
             recording = path.with_name(path.name.removesuffix(f".{SIGNATURE_FILE}") + ".mcap")
             if recording.exists():
                 continue
@@ -290,10 +302,10 @@ class _ChainAudit:
             self._add(chain.NAME, Kind.CUT, stored=None, again="a first entry")
             return
         for folder in (self.folder / FOLDER, self.folder.parent / FOLDER):
-            for path in folder.glob(f"*-{entries[0].digest[:16]}.head"):
-                memory = Memory(path).read()
-                if memory is not None and memory[1] not in digests:
-                    self._add(chain.NAME, Kind.CUT, stored=last, again=f"entry {memory[0]}")
+            for known in chain.memories(folder):
+                ours = known.of == str(self.folder.resolve()) or entries[0].digest[:16] in known.path.name
+                if ours and known.digest not in digests:
+                    self._add(chain.NAME, Kind.CUT, stored=last, again=f"entry {known.number}")
 
 
 def _claims_in(entry: Entry) -> Claims | None:

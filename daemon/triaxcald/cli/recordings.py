@@ -33,7 +33,7 @@ def audit_command(a: argparse.Namespace) -> int:
     from triaxcald.audit import Audited, Policy, audit_chain, audit_each, text, to_audit, worst  # which no `log` needs
 
     policy = Policy(a.trust, a.allow_unsigned)
-    folders = _chains(a)
+    chains = [audit_chain(folder, policy, a.head) for folder in _chains(a)]
     asked = to_audit(a.recordings)
     audited: list[Audited] = []
     with at_abort(lambda _: AbortNotice(text.stopped(audited, len(asked)))):
@@ -50,7 +50,6 @@ def audit_command(a: argparse.Namespace) -> int:
                 if (signed := text.signature(one.audit.signature)) is not None:
                     show(f"  {signed}")
                 sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
-    chains = [audit_chain(folder, policy, a.head) for folder in folders]
     if a.json:
         emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
               "summary": text.counts(audited),
@@ -65,6 +64,8 @@ def audit_command(a: argparse.Namespace) -> int:
 
 def _chains(a: argparse.Namespace) -> list[Path]:
     """Folders whose chains are asked for. Raises InputError."""
+    from triaxcald.audit import chains_in
+
     if a.head is not None and not a.chain:
         raise InputError("--head: only --chain compares it")
     if not a.chain:
@@ -72,9 +73,10 @@ def _chains(a: argparse.Namespace) -> list[Path]:
     for given in a.recordings:
         if not given.is_dir():
             raise InputError(f"{given}: --chain takes folders of stations, expected a folder")
-    if a.head is not None and len(a.recordings) > 1:
-        raise InputError("--head: the head of one folder, and several are given")
-    return list(a.recordings)
+    found = [folder for given in a.recordings for folder in chains_in(given)]
+    if a.head is not None and len(found) > 1:
+        raise InputError(f"--head: is of one chain, and {len(found)} are audited")
+    return found
 
 
 def info_command(a: argparse.Namespace) -> int:

@@ -36,6 +36,8 @@ from triaxcald.station.lock import fcntl
 FORMAT: Final = "triaxcal.chain/1"
 NAME: Final = "chain.jsonl"
 PENDING: Final = "chain.pending"
+MEMORY: Final = ".head"
+"""Suffix of what a key remembers of a chain."""
 CHAIN_MOST: Final = 2**30
 """Bytes of a chain that are read: five million recordings."""
 _TAIL: Final = 2**16  # bytes; a line of a recording has some 250
@@ -296,32 +298,47 @@ def _opened(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Memory:
-    """The last entry that a key has signed in a chain."""
+    """The last entry that a key has signed in a chain: ``number`` and ``digest``, in
+    the folder of recordings ``of``."""
 
     path: Path
+    number: int
+    digest: str
+    of: str
 
     @staticmethod
-    def of(folder: Path, key: str, start: Entry) -> Memory:
-        return Memory(folder / f"{key}-{start.digest[:16]}.head")
+    def path_of(folder: Path, key: str, start: Entry) -> Path:
+        return folder / f"{key}-{start.digest[:16]}{MEMORY}"
 
-    def read(self) -> tuple[int, str] | None:
-        """Number and digest; None where nothing is remembered."""
+    @staticmethod
+    def read(path: Path) -> Memory | None:
+        """None of what is none."""
         try:
-            found: Mapping[str, Any] = json_value(self.path.read_bytes())
-            return int(found["number"]), str(found["digest"])
+            found: Mapping[str, Any] = json_value(path.read_bytes())
+            return Memory(path, int(found["number"]), str(found["digest"]), str(found["of"]))
         except (OSError, ValueError, LookupError, TypeError, RecursionError):
             return None
 
-    def write(self, head: Entry) -> None:
+    def write(self) -> None:
         """Raises nothing: a folder of keys may be read-only."""
+        document = {"number": self.number, "digest": self.digest, "of": self.of}
         with suppress(OSError):
-            write_durably(self.path, json.dumps({"number": head.number, "digest": head.digest}) + "\n")
+            write_durably(self.path, json.dumps(document) + "\n")
 
-    def require(self, head: Entry) -> None:
-        """Raises NotSigned where the chain ends before what the key remembers."""
-        known = self.read()
-        if known is not None and (head.number < known[0] or (head.number == known[0] and head.digest != known[1])):
-            raise NotSigned(
-                f"{NAME} ends with entry {head.number}, and the key remembers entry {known[0]}: the chain was cut; "
-                f"put it back, or remove {self.path} to go on from here"
-            )
+
+def memories(folder: Path, key: str = "*") -> list[Memory]:
+    """All that the keys in a folder remember."""
+    return [found for path in sorted(folder.glob(f"{key}-*{MEMORY}")) if (found := Memory.read(path)) is not None]
+
+
+def require_remembered(known: Memory | None, head: Entry | None) -> None:
+    """Raises NotSigned where a chain ends before what the key remembers of it."""
+    if known is None:
+        return
+    number = -1 if head is None else head.number
+    if number < known.number or (head is not None and number == known.number and head.digest != known.digest):
+        ends = "is gone" if head is None else f"ends with entry {number}"
+        raise NotSigned(
+            f"{NAME} {ends}, and the key remembers entry {known.number}: put the chain back, or remove {known.path} to "
+            "go on from here"
+        )

@@ -79,12 +79,12 @@ class StationSigning:
         try:
             with chain.locked(self.folder) as open_chain:
                 if open_chain.head is None:
+                    self._require_new()
                     self._begin(open_chain)
                 open_chain.settle()
                 head = open_chain.head
                 assert head is not None
-                if (memory := self._memory(open_chain)) is not None:
-                    memory.require(head)
+                chain.require_remembered(self._remembered(open_chain), head)
                 yield open_chain, self._claims(head.number + 1, head.digest)
         except DiskError:
             raise
@@ -98,12 +98,26 @@ class StationSigning:
 
     def _append(self, open_chain: OpenChain, entry: Entry) -> None:
         open_chain.append(entry)
-        if (memory := self._memory(open_chain)) is not None:
-            memory.write(entry)
+        if self.key.folder is not None:
+            path = Memory.path_of(self.key.folder, self.key.name, open_chain.start())
+            Memory(path, entry.number, entry.digest, self._of).write()
 
-    def _memory(self, open_chain: OpenChain) -> Memory | None:
+    @property
+    def _of(self) -> str:
+        """The folder as the key remembers it."""
+        return str(self.folder.resolve())
+
+    def _remembered(self, open_chain: OpenChain) -> Memory | None:
+        """What the key remembers of a chain that has begun."""
         folder = self.key.folder
-        return None if folder is None else Memory.of(folder, self.key.name, open_chain.start())
+        return None if folder is None else Memory.read(Memory.path_of(folder, self.key.name, open_chain.start()))
+
+    def _require_new(self) -> None:
+        """Raises NotSigned where the folder had a chain before."""
+        if self.key.folder is not None:
+            for known in chain.memories(self.key.folder, self.key.name):
+                if known.of == self._of:
+                    chain.require_remembered(known, None)
 
     def _claims(self, number: int, previous: str) -> Claims:
         return Claims(self.key.name, to_text(self.key.public), iso_time(self.clock_ns()), number, previous)
@@ -123,11 +137,13 @@ class StationSigning:
         try:
             if not verifies(self.key.public, self.key.sign(probe), probe):
                 raise InputError(f"key {self.key.name}: what it signs is not verified by its own public key")
-            if (self.folder / chain.NAME).exists():
-                with chain.locked(self.folder) as open_chain:
-                    if open_chain.head is not None and (memory := self._memory(open_chain)) is not None:
-                        open_chain.settle()
-                        memory.require(open_chain.head)
+            if not (self.folder / chain.NAME).exists():
+                self._require_new()
+                return
+            with chain.locked(self.folder) as open_chain:
+                if open_chain.head is not None:
+                    open_chain.settle()
+                    chain.require_remembered(self._remembered(open_chain), open_chain.head)
         except OSError as e:
             raise InputError(f"{self.folder / chain.NAME}: cannot be written: {e.strerror}") from e
         except DaemonError as e:

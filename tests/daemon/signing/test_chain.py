@@ -25,7 +25,7 @@ from tests.daemon.signing.line import (
     when,
     write_lines,
 )
-from triaxcald.audit import Policy, audit_chain
+from triaxcald.audit import Policy, audit_chain, chains_in
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State
 from triaxcald.errors import InputError, NotSigned
@@ -494,3 +494,31 @@ def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, 
     assert line.made[2].with_suffix(f".{ATTACHMENT}").exists()
     found = audit_chain(line.folder)
     assert (found.differences, found.tombstones) == ((), 1)
+
+
+def test_a_station_whose_chain_is_gone_does_not_begin_another(line: Line, key: SigningKey) -> None:
+    assert key.folder is not None
+    other = Line(line.folder.parent / "new", line.key)
+    other.folder.mkdir()
+    other.record()
+    (other.folder / chain.NAME).unlink()
+    with pytest.raises(InputError):
+        other.signing.require_works()
+    with pytest.raises(NotSigned):
+        other.record()
+    for memory in chain.memories(line.folder / "keys"):
+        if memory.of == str(other.folder.resolve()):
+            memory.path.unlink()
+    other.signing.require_works()
+    other.record("again.mcap")
+    assert [d.kind for d in audit_chain(other.folder).differences] == [Kind.INSERTED]
+
+
+def test_each_chain_below_a_folder_is_its_own(line: Line, keys: Keys) -> None:
+    below = line.folder / "station-2"
+    below.mkdir()
+    Line(below, line.key, line.now_ns).record("other.mcap")
+    assert chains_in(line.folder) == [line.folder, below]
+    assert chains_in(line.folder.parent) == [line.folder, below]
+    assert [audit_chain(folder).differences for folder in chains_in(line.folder)] == [(), ()]
+    assert chains_in(below / "nowhere") == [below / "nowhere"]
