@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -296,8 +297,6 @@ def _decoded(text: str) -> bytes:
 
 def stamp_asked_for(attachments: Mapping[str, bytes]) -> bool:
     """Whether the station file in the recording names an authority."""
-    import tomllib
-
     try:
         sign = tomllib.loads(attachments[STATION_FILE].decode())["sign"]
         return isinstance(sign["timestamp"], str)

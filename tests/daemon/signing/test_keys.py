@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import stat
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -192,6 +193,25 @@ def test_the_trust_file_is_that_of_the_nearest_folder(tmp_path: Path) -> None:
     assert found.since.isoformat() == "2026-01-01T00:00:00+00:00"
     assert nearest(within / "not" / "there", "trust.toml") == found.path
     assert nearest(tmp_path, "no such file") is None
+
+
+@pytest.mark.parametrize(("module", "extra"), [("cryptography", "sign"), ("pkcs11", "hsm"), ("rfc3161_client", "sign")])
+def test_a_missing_package_is_named_with_its_extra(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, module: str, extra: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from triaxcald.signing.stamps import require_installed
+
+    for name in [module, *(name for name in sys.modules if name.startswith(f"{module}."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setenv(PASSPHRASE, "1234")
+    command = ["keys", "new", "line-1"] + (["--module", "/none.so", "--token", "t"] if module == "pkcs11" else [])
+    if module == "rfc3161_client":
+        with pytest.raises(InputError, match=r"triaxcal\[sign\]"):
+            require_installed()
+    else:
+        assert main(command) == 2
+        assert f"triaxcal[{extra}]" in capsys.readouterr().err
+    assert not list(folder.iterdir())
 
 
 # A token.
