@@ -798,7 +798,9 @@ def _keys(commands: Any) -> None:
     p.add_argument("--module", metavar="MODULE", type=Path, help="make it in a device, by this library (PKCS #11)")
     p.add_argument("--token", metavar="LABEL", help="which token of the device; the passphrase is its PIN")
     _add_key_folder(p)
-    p = _command(parts, "list", "keys:list_command", "show keys, and which are trusted", "", "keys list")
+    p = _command(
+        parts, "list", "keys:list_command", "show keys, and which are trusted", "", "keys list --folder station"
+    )
     _add_key_folder(p)
     p = _command(
         parts, "trust", "keys:trust_command", "trust a key, or a time-stamping authority",
