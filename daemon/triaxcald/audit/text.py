@@ -98,7 +98,7 @@ def _what(of: Difference) -> str:
         case Kind.CLOCK:
             return f"{place}: {_bare(of.stored)} cannot be, by {_bare(of.again)}: a clock was set back"
         case Kind.REMOVED:
-            return f"entry {of.again} of the chain, and not there; no tombstone says why"
+            return f"entry {of.again} of the chain is of no recording in the folder, and no tombstone says why"
         case Kind.INSERTED:
             return f"not in the chain ({_bare(of.again)})"
         case Kind.COPIED:
