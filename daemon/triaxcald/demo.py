@@ -13,15 +13,20 @@ from typing import Any
 import numpy as np
 
 import triaxcal as tc
+import triaxcal_drivers as td
 from triaxcald.errors import INTERRUPTED, InputError
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
 from triaxcald.run.unit_run import Outcome, TrayRun, UnitRun
+from triaxcald.signing.keys import FOLDER as KEYS
+from triaxcald.signing.keys import new_key, private_keys
+from triaxcald.signing.trust import trust_key
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
 from triaxcald.verification import Verification
 
+KEY = "demo"
 SPEED = 20.0
 HIDDEN = ("second_order_nonlinearity", "temperature_bias", "temperature_scale_factor")
 """Effects that the reference unit has registers for."""
@@ -83,6 +88,7 @@ async def run_demo(folder: Path, seed: int, progress: Progress, ended: Callable[
     async with AsyncExitStack() as first:
         units = [simulate(d, where="demo") for d in devices]
         servers = [await first.enter_async_context(unit.serve()) for unit in units]
+        make_key(folder)
         path = folder / "station.toml"
         write_text(path, _station(devices, channel, servers[1].bus.port))
         outcomes = await TrayRun(load_station(path), progress, ended=ended)
@@ -94,6 +100,14 @@ async def run_demo(folder: Path, seed: int, progress: Progress, ended: Callable[
         DemoUnit(unit.truth, outcome, check, _found(unit, outcome), _kept(check))
         for unit, outcome, check in zip(units, outcomes, checks, strict=True)
     ]
+
+
+def make_key(folder: Path) -> None:
+    """A trusted key of the demo's own, if it has none yet; none without the extra
+    `sign`. Raises InputError."""
+    if td.hints.absent(("cryptography",)) is None and not private_keys(folder / KEYS):
+        made = new_key(folder / KEYS, KEY, None)
+        trust_key(folder, KEY, made.public)
 
 
 def demo_effects(seed: int) -> list[tuple[str, dict[str, float]]]:

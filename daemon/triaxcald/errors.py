@@ -34,6 +34,11 @@ class DiskError(RecordingError):
     exit_code = 5
 
 
+class NotSigned(DiskError):
+    """A recording could not be signed, and so was not closed; the next start closes
+    it."""
+
+
 class StationError(DaemonError):
     """The station or a device on it failed while at work."""
 

@@ -106,8 +106,13 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "batch diagnose": """As [`diagnose`](#triaxcal-diagnose), each by itself. [Columns](many.md#batch-diagnose).""",
     "batch verify": """As [`verify`](#triaxcal-verify). [Columns](many.md#batch-verify).""",
     "batch apply": """As [`apply`](#triaxcal-apply), to NAME.csv in FOLDER, which is made where it is not there; workers elsewhere must reach it by the same path. A file that was there before is left, and its recording has exit code 2; with `--resume` a file that TABLE tells of is replaced if its recording has changed. Two recordings of one name are an error (exit 2). [Columns](many.md#batch-apply).""",  # noqa: E501
+    "keys new": """[How](../how-to/sign-recordings.md). Private keys are encrypted (PKCS #8, scrypt), with file mode 0600, and never overwritten. A station signs by the only key in `keys` beside its station file, or by that of `[sign]`.""",  # noqa: E501
+    "keys list": """Those in the folder `keys`, and those of the trust file.""",
+    "keys trust": """Enters the key into `trust.toml`, which is made with `since` if there is none. An audit then takes unsigned recordings for differences.""",  # noqa: E501
+    "keys revoke": """Signatures of the key are trusted no more, but for those that a time stamp shows to be from before.""",  # noqa: E501
     "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501
+    "log delete": """Only recordings in the station's folder, and only of a station with a key. The tombstone is in the chain before anything is deleted.""",  # noqa: E501
     "log export": """A phase or stream without samples is an error (exit 2). The output must not exist.""",
     "log import": """LOG may be a recording of [all frames of a bus](recording.md#all-frames-of-a-bus). A summary of dropped frames is on standard error. [How](../how-to/import-a-log.md). Document `triaxcal.import/1`.""",  # noqa: E501
 }

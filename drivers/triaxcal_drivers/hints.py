@@ -60,9 +60,19 @@ EXTRAS = {
     "fsspec": "fleet",
     "s3fs": "fleet",
     "aiohttp": "fleet",
+    "cryptography": "sign",
+    "rfc3161_client": "sign",
+    "pkcs11": "hsm",
 }
 """Extra of each module, by import name."""
-CALLED = {"can": "python-can", "serial": "pyserial", "sse_starlette": "sse-starlette", "argon2": "argon2-cffi"}
+CALLED = {
+    "can": "python-can",
+    "serial": "pyserial",
+    "sse_starlette": "sse-starlette",
+    "argon2": "argon2-cffi",
+    "rfc3161_client": "rfc3161-client",
+    "pkcs11": "python-pkcs11",
+}
 """Package names that differ from the import name."""
 
 

@@ -36,8 +36,13 @@ _TOKENS = re.compile(
 )
 
 
-PROFILE, STATION, DEVICE = "triaxcal.profile/1", "triaxcal.station/1", "triaxcal.device/1"
-_CALLED = {PROFILE: "a profile", STATION: "a station file", DEVICE: "the file of a simulated device"}
+PROFILE, STATION, DEVICE, TRUST = "triaxcal.profile/1", "triaxcal.station/1", "triaxcal.device/1", "triaxcal.trust/1"
+_CALLED = {
+    PROFILE: "a profile",
+    STATION: "a station file",
+    DEVICE: "the file of a simulated device",
+    TRUST: "a file of trusted keys",
+}
 
 
 def read_toml(path: Path, *, expected: str, pipe: bool = False) -> bytes:

@@ -5,6 +5,8 @@ What is found are values; `triaxcald.audit.text` makes lines of them, which
 nothing reads back.
 """
 
+from triaxcald.audit.chain import ChainAudit, audit_chain, chains_in
 from triaxcald.audit.conduct import Audit, audit
+from triaxcald.audit.signature import Policy
 
-__all__ = ["Audit", "audit"]
+__all__ = ["Audit", "ChainAudit", "Policy", "audit", "audit_chain", "chains_in"]

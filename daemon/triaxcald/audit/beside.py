@@ -9,8 +9,9 @@ import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.outcome import ATTACHMENT, CERTIFICATE, REPORT, SUFFIX, digest_of
 from triaxcald.recording.mcap_records import ATTACHMENT_LIMIT
+from triaxcald.recording.schema import SIGNATURE_FILE
 
-NAMES = (CERTIFICATE, REPORT, ATTACHMENT)
+NAMES = (CERTIFICATE, REPORT, SIGNATURE_FILE, ATTACHMENT)
 
 
 def beside(path: td.files.AnyPath, held: Mapping[str, bytes]) -> tuple[list[Difference], list[str]]:

@@ -32,6 +32,8 @@ from triaxcald.audit.results import (
     report_of,
     sealed_later,
 )
+from triaxcald.audit.signature import Policy, Signature, State
+from triaxcald.audit.signature import check as check_signature
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.audit.within import COMPUTES, Within, moved, same_within
 from triaxcald.computer import KEYS, computer
@@ -105,6 +107,7 @@ class Audit:
     serial: str | None = None
     run: str | None = None
     """Of the outcome, where it has them."""
+    signature: Signature = field(default_factory=lambda: Signature(State.UNSIGNED))
 
     @property
     def result(self) -> Result:
@@ -115,10 +118,17 @@ class Audit:
         return Result.SAME_FIGURES if self.agreement.figures else Result.SAME_BYTES
 
 
-def audit(path: td.files.AnyPath, *, compute: Compute = compute, within: float | None = None) -> Audit:
-    """Raises RecordingError where the file cannot be read, or holds no result.
-    ``compute`` makes the results again. ``within``: so much of its uncertainty a figure
-    may be off that another version of triaxcal, numpy or scipy computed."""
+def audit(
+    path: td.files.AnyPath,
+    *,
+    compute: Compute = compute,
+    within: float | None = None,
+    policy: Policy = Policy(),  # noqa: B008 - frozen
+) -> Audit:
+    """Raises RecordingError where the file cannot be read, or holds no result;
+    InputError for an unusable trust file. ``compute`` makes the results again.
+    ``within``: so much of its uncertainty a figure may be off that another version of
+    triaxcal, numpy or scipy computed. ``policy`` is what is asked of signatures."""
     if is_manifest(path):
         raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
     # Pictures are made of cycles: garbage is looked for seldom, not a hundred times.
@@ -130,7 +140,7 @@ def audit(path: td.files.AnyPath, *, compute: Compute = compute, within: float |
             )
         if recording.ends_with != FORMAT:
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
-        return _Audit(path, recording, compute, within).run()
+        return _Audit(path, recording, compute, within, policy).run()
 
 
 COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
@@ -139,9 +149,9 @@ COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
 
 class _Audit:
     def __init__(
-        self, path: td.files.AnyPath, recording: Recording, compute: Compute, within: float | None = None
+        self, path: td.files.AnyPath, recording: Recording, compute: Compute, within: float | None, policy: Policy
     ) -> None:
-        self._path, self._recording, self._compute = path, recording, compute
+        self._path, self._recording, self._compute, self._policy = path, recording, compute, policy
         self._held = {name: recording.attachments[name] for name in recording.attachments if "/" not in name}
         self._checked: list[str] = []
         self._differences: list[Difference] = []
@@ -169,6 +179,8 @@ class _Audit:
         self._differences += contents.faults(found)
         if self._outcome:
             self._differences += contents.against_inventory(found, self._outcome)
+        signature, unproven = check_signature(self._path, self._held, found, self._policy)
+        self._differences += unproven
         differing, not_beside = beside(self._path, self._held)
         self._differences += differing
         return Audit(
@@ -184,6 +196,7 @@ class _Audit:
             self._within,
             self._said("serial"),
             self._said("run"),
+            signature,
         )
 
     def _said(self, key: str) -> str | None:

@@ -83,6 +83,35 @@ class Kind(Enum):
     ALONE = auto()
     """There is none in the recording."""
 
+    # Of signatures.
+    UNSIGNED = auto()
+    """It has none, and the trust file asks for one."""
+    NO_ENVELOPE = auto()
+    """It is none; ``again`` says why."""
+    NOT_VERIFIED = auto()
+    """It is not of its key, or a time stamp is not of it."""
+    UNTRUSTED = auto()
+    """The trust file does not have the key ``again``."""
+    REVOKED = auto()
+    CLOCK = auto()
+    """A time before one that it cannot be before."""
+
+    # Of the chain of a folder.
+    REMOVED = auto()
+    """A recording of the chain that is not there, and that no tombstone is of."""
+    INSERTED = auto()
+    """A recording that the chain does not have."""
+    COPIED = auto()
+    """``again`` is the other file with the same recording."""
+    RENAMED = auto()
+    LATE = auto()
+    """Signed long after its end."""
+    BROKEN = auto()
+    """An entry that does not follow from the one before."""
+    CUT = auto()
+    """The chain ends before an entry that is known."""
+    NO_CHAIN = auto()
+
 
 @dataclass(frozen=True)
 class Difference:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from hashlib import sha256
+from pathlib import Path
 from typing import Final
 
 import triaxcal_drivers as td
 from triaxcald.audit import text
 from triaxcald.audit.conduct import Audit, audit
+from triaxcald.audit.signature import Policy
 from triaxcald.errors import DONE, OUTSIDE
-from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding
+from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding, Found
 from triaxcald.many.sources import LIST
 from triaxcald.schema.columns import Kind
+from triaxcald.signing.trust import load_trust
+from triaxcald.stores import is_url
 
 ENDINGS: Final = (".mcap",)
 """Ends of names of recordings in a folder."""
@@ -24,6 +30,12 @@ COLUMNS: Final[tuple[Column[Audit], ...]] = (
     Column("serial", Kind.TEXT, "serial number of the unit", lambda a: a.serial),
     Column("run", Kind.TEXT, "id of the run", lambda a: a.run),
     Column("made_by", Kind.TEXT, "version that made the recording, if it is another one", lambda a: a.made_by),
+    Column(
+        "signature", Kind.TEXT, "`unsigned`, `trusted`, `untrusted`, `revoked` or `invalid`",
+        lambda a: a.signature.state.value,
+    ),
+    Column("signed_by", Kind.TEXT, "name of the key", lambda a: a.signature.name),
+    Column("signed_at", Kind.TEXT, "when, by the signature itself", lambda a: a.signature.signed),
     Column("differences", Kind.WHOLE, "number of differences", lambda a: len(a.differences)),
     Column(
         "first_difference", Kind.TEXT, "the first of them",
@@ -37,9 +49,22 @@ COLUMNS: Final[tuple[Column[Audit], ...]] = (
 )  # fmt: skip
 
 
-def audited(path: td.files.AnyPath, *, within: float | None = None) -> Finding:
-    """Raises what `audit` does; ``within`` as there."""
-    found = audit(path, within=within)
+def trust_digests(found: Iterable[Found], policy: Policy) -> list[tuple[str, str]]:
+    """The trust files of recordings, with their SHA-256: a row that was stored under
+    another one is done again. Raises InputError."""
+    paths = {path.parent: path for of in found if not is_url(of.name) for path in (Path(of.name),)}
+    files = {file for path in paths.values() if (file := policy.file_of(path)) is not None}
+    return sorted((str(file), sha256(load_trust(file).file.model_dump_json().encode()).hexdigest()) for file in files)
+
+
+def audited(
+    path: td.files.AnyPath,
+    *,
+    within: float | None = None,
+    policy: Policy = Policy(),  # noqa: B008 - frozen
+) -> Finding:
+    """Raises what `audit` does; ``within`` and ``policy`` as there."""
+    found = audit(path, within=within, policy=policy)
     return Finding(
         {column.name: column.value(found) for column in COLUMNS if column not in (*COMMON_BEFORE, *COMMON_AFTER)},
         OUTSIDE if found.differences else DONE,

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import ceil, floor, log10
 from typing import Any
 
 import triaxcal as tc
+from triaxcald.audit.chain import ChainAudit
 from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
 from triaxcald.audit.figures import SHARE, Agreement
+from triaxcald.audit.signature import Signature, State
 from triaxcald.audit.within import Moved, Within
+from triaxcald.signing.stamps import Stamp, StampState
 
 _LONGEST = 60
 
@@ -81,6 +84,36 @@ def _what(of: Difference) -> str:
             return "the file beside the recording is not the one in it"
         case Kind.ALONE:
             return "lies beside the recording, which has none"
+        case Kind.UNSIGNED:
+            return "missing: the recording is not signed, and the trust file asks for it; --allow-unsigned lets it pass"
+        case Kind.NO_ENVELOPE:
+            return f"no signature: {_bare(of.again)}"
+        case Kind.NOT_VERIFIED if place:
+            return f"{place}: of {_bare(of.again)}"
+        case Kind.NOT_VERIFIED:
+            return "the signature is not of its key over this content"
+        case Kind.UNTRUSTED:
+            return f"signed by a key that the trust file does not have, {_bare(of.again)}"
+        case Kind.REVOKED:
+            return f"signed by key {_bare(of.again)}, which is revoked"
+        case Kind.CLOCK:
+            return f"{place}: {_bare(of.stored)} cannot be, by {_bare(of.again)}: a clock was set back"
+        case Kind.REMOVED:
+            return f"entry {of.again} of the chain is of no recording in the folder, and no tombstone says why"
+        case Kind.INSERTED:
+            return f"not in the chain ({_bare(of.again)})"
+        case Kind.COPIED:
+            return f"the same recording as {_bare(of.again)}"
+        case Kind.RENAMED:
+            return f"was signed under the name {_bare(of.stored)}"
+        case Kind.LATE:
+            return f"signed on {_bare(of.stored)}, long after its end on {_bare(of.again)}"
+        case Kind.BROKEN:
+            return f"entry {place}: {_bare(of.again)}"
+        case Kind.CUT:
+            return f"the chain ends with entry {stored}; {_bare(of.again)} is known, so it was cut"
+        case Kind.NO_CHAIN:
+            return "there is no chain in the folder of these signed recordings"
 
 
 def _records(of: Difference) -> str:
@@ -112,6 +145,57 @@ def notes(of: Notes) -> list[str]:
     if of.not_beside:
         found.append(f"not beside the recording: {', '.join(of.not_beside)}")
     return found
+
+
+def signature(of: Signature) -> str | None:
+    """Who signed it, and when; None of a recording without a signature."""
+    if of.state is State.UNSIGNED:
+        return "not signed; it is from before the trust file" if of.older else None
+    if of.state is State.INVALID:
+        return "the signature is not valid"
+    told = f"signed by {of.name or of.key} on {of.signed}, entry {of.number}; {_TRUST[of.state]}"
+    if of.state is State.UNTRUSTED:
+        told += " (no trust file)" if of.trust is None else f" ({of.trust})"
+    return f"{told}{_stamped(of.stamp)}"
+
+
+_TRUST = {
+    State.TRUSTED: "the key is trusted",
+    State.UNTRUSTED: "nothing says that the key is trusted",
+    State.REVOKED: "the key is revoked",
+}
+
+
+def _stamped(stamp: Stamp | None) -> str:
+    if stamp is None:
+        return ""
+    if stamp.state is StampState.MISSING:
+        return "; the time stamp that the station asks for is missing"
+    if stamp.state is StampState.INVALID or stamp.time is None:
+        return "; the time stamp is not valid"
+    by = f"by {stamp.authority}" if stamp.authority else "by an authority that the trust file does not have"
+    return f"; time stamp {stamp.time.isoformat()} {by}"
+
+
+def chained(of: ChainAudit) -> list[str]:
+    """The chain of a folder, in lines."""
+    number = tc.number_format.number_of
+    told = [f"{number(of.recordings, 'signed recording')}", f"{number(of.tombstones, 'tombstone')}"]
+    if of.earlier:
+        told.append(f"{of.earlier} from before")
+    head = f"; head {of.head[0]}, {of.head[1]}" if of.head else ""
+    result = "the chain differs" if of.differences else "the chain is whole"
+    return [f"{of.folder}: {result} ({', '.join(told)}){head}", *(f"  {difference(d)}" for d in of.differences)]
+
+
+def chain_document(of: ChainAudit) -> dict[str, Any]:
+    """An entry of `chains` in `triaxcal.audit/1`."""
+    return {**of.document(), "differences": [difference(d) for d in of.differences], "codes": codes(of.differences)}
+
+
+def codes(of: Sequence[Difference]) -> list[str]:
+    """The kind of each difference, for programs."""
+    return [d.kind.name.lower() for d in of]
 
 
 def heading(of: Audit) -> str:
@@ -183,7 +267,13 @@ def _where(of: Audit) -> str:
 
 def lines(of: Audit) -> list[str]:
     """All that there is to say of one audit."""
-    return [heading(of), *(f"  {difference(d)}" for d in of.differences), *(f"  note: {n}" for n in notes(of.notes))]
+    signed = signature(of.signature)
+    return [
+        heading(of),
+        *(f"  {difference(d)}" for d in of.differences),
+        *(f"  note: {n}" for n in notes(of.notes)),
+        *([] if signed is None else [f"  {signed}"]),
+    ]
 
 
 AGREE, DIFFER, UNREADABLE = "agree", "differ", "unreadable"
@@ -226,8 +316,10 @@ def document(recording: str, found: Audit | None, error: str | None = None) -> d
         "recording": recording,
         "checked": list(found.checked) if found else [],
         "differences": [difference(d) for d in found.differences] if found else [],
+        "codes": codes(found.differences) if found else [],
         "notes": notes(found.notes) if found else [],
         "verdict": found.verdict if found else None,
+        "signature": found.signature.document() if found else None,
         "error": error,
         "result": found.result.value if found else None,
         "largest_difference": _agreement(found.agreement) if found else None,

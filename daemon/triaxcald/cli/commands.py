@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import triaxcal_drivers as td
+from triaxcald.cli.keys_syntax import register_keys
 from triaxcald.cli.many_syntax import register_many
 from triaxcald.cli.syntax import OneLineParser, keep_apart, parsed, register
 from triaxcald.memory import require_address_space
@@ -29,6 +30,7 @@ def parser() -> OneLineParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     register(commands)
     register_many(commands)
+    register_keys(commands)
     return top
 
 

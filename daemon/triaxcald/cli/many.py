@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -235,9 +236,11 @@ def said_options(options: dict[str, Any]) -> str:
 
 
 def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import many, text  # the whole line, which no other command needs
+    from triaxcald.audit import Policy, audit_chain, many, text  # the whole line, which no other command needs
 
     _require_agreeing(a)
+    policy = Policy(a.trust, a.allow_unsigned)
+    chains = [audit_chain(folder, policy, a.head) for folder in _chains(a)]
     found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS)
     if a.as_made:
         return _audit_as_made(a, found)
@@ -259,9 +262,11 @@ def audit_command(a: argparse.Namespace) -> int:
     job = Job(
         "audit",
         "auditing",
-        partial(many.audited, within=a.within),
+        partial(many.audited, within=a.within, policy=policy),
         many.COLUMNS,
-        said_options({"within": a.within}),
+        said_options(
+            {"within": a.within, "allow_unsigned": a.allow_unsigned, "trust": many.trust_digests(found, policy)}
+        ),
         found,
         each,
         lambda: text.stopped(counts, len(found)),
@@ -269,10 +274,32 @@ def audit_command(a: argparse.Namespace) -> int:
     code = run_job(job, a)
     if a.json:
         audits = [documents[of.name] for of in found]
-        emit({"format": "triaxcal.audit/1", "audits": audits, "summary": text.counts(counts)})
-    elif len(found) > 1 or a.output is not None:
-        show(text.summary(counts))
-    return code
+        told = {"chains": [text.chain_document(of) for of in chains]} if a.chain else {}
+        emit({"format": "triaxcal.audit/1", "audits": audits, "summary": text.counts(counts), **told})
+    else:
+        if len(found) > 1 or a.output is not None:
+            show(text.summary(counts))
+        for line in chain(*map(text.chained, chains)):
+            show(line)
+    return severest([code, *(of.exit_code for of in chains)])
+
+
+def _chains(a: argparse.Namespace) -> list[Path]:
+    """Folders whose chains are asked for. Raises InputError."""
+    from triaxcald.audit import chains_in
+
+    if a.head is not None and not a.chain:
+        raise InputError("--head: only --chain compares it")
+    if not a.chain:
+        return []
+    folders = [Path(given) for given in a.recordings]
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: --chain takes folders of stations, expected a folder")
+    found = [below for folder in folders for below in chains_in(folder)]
+    if a.head is not None and len(found) > 1:
+        raise InputError(f"--head: is of one chain, and {len(found)} are audited")
+    return found
 
 
 def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
@@ -313,7 +340,7 @@ def _require_agreeing(a: argparse.Namespace) -> None:
         raise InputError("--wheels: only --as-made installs something")
     if a.as_made and a.within is not None:
         raise InputError("--within: under the versions that made it nothing may be off; leave out --as-made")
-    here = [f"--{name}" for name in ("output", "resume", "jobs", "scheduler", "memory") if getattr(a, name)]
+    here = [f"--{name}" for name in ("output", "resume", "jobs", "scheduler", "memory", "chain") if getattr(a, name)]
     if a.as_made and here:
         raise InputError(f"{here[0]}: --as-made audits one recording after the other, without a table")
     urls = [name for name in a.recordings if a.as_made and is_url(name)]

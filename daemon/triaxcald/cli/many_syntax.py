@@ -63,7 +63,18 @@ def _audit(commands: Any) -> None:
     )  # fmt: skip
     add_many(p)
     _add_other_versions(p)
+    _add_signatures(p)
     add_json(p)
+
+
+def _add_signatures(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--trust", metavar="FILE", type=Path,
+        help="with the trusted keys; default: trust.toml in the recording's folder or above it",
+    )  # fmt: skip
+    p.add_argument("--allow-unsigned", action="store_true", help="unsigned recordings, and keys unknown, may pass")
+    p.add_argument("--chain", action="store_true", help="look for recordings that were removed or inserted, too")
+    p.add_argument("--head", metavar="DIGEST", help="with --chain: of an entry that it had, by an earlier audit")
 
 
 def _add_other_versions(p: argparse.ArgumentParser) -> None:

@@ -261,7 +261,7 @@ def _of_units(
         elif warning := of_a_journal(session.station, session.name, identity.serial):
             progress.say("warning", "journal", unit=session.name, message=warning)
 
-    segments = _segments(a)
+    segments = _segments(a, station)
     sessions = [UnitSession(station, place, progress, serials=serials) for place in places]
     return [UnitRecording(session, path_of(session), identified, segments) for session in sessions]
 
@@ -278,19 +278,26 @@ def _of_buses(
             return Path(a.output) / f"{bus.name}{SUFFIX}"
         return unused(Path(a.output) / bus_recording_name(bus.name, time.time_ns()))
 
-    segments = _segments(a)
+    segments = _segments(a, station)
     return [BusRecording(station, bus, progress, partial(path_of, bus), segments) for bus in buses]
 
 
-def _segments(a: argparse.Namespace) -> Segments | None:
-    """Segments by the options; None without any of these."""
+def _segments(a: argparse.Namespace, station: Station) -> Segments | None:
+    """Segments by the options; None without any of these. A station with a key signs
+    which it deletes. Raises InputError if it cannot."""
     from triaxcald.recording.manifest import SEGMENT_BYTES, SEGMENT_S, Retention
     from triaxcald.run.session import Segments
 
     if all(given is None for given in (a.segment_size, a.segment_time, a.keep, a.keep_free)):
         return None
     retention = None if a.keep is a.keep_free is None else Retention(a.keep, a.keep_free or 0)
-    return Segments(a.segment_size or SEGMENT_BYTES, a.segment_time or SEGMENT_S, retention)
+    bury = None
+    if retention is not None:
+        from triaxcald.signing.station import signing_of
+
+        signing = signing_of(station)
+        bury = None if signing is None else signing.bury
+    return Segments(a.segment_size or SEGMENT_BYTES, a.segment_time or SEGMENT_S, retention, bury)
 
 
 def _of_station(

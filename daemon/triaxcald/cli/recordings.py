@@ -77,6 +77,19 @@ def _opened(path: Path) -> AbstractContextManager[BinaryIO]:
     return open(path, "wb") if is_stream(path) else new_file(path)
 
 
+def delete_command(a: argparse.Namespace) -> int:
+    from triaxcald.signing.deletion import delete
+    from triaxcald.station.config import load_station
+
+    deleted = delete(load_station(a.station), a.recordings, a.reason)
+    if a.json:
+        emit({"format": "triaxcal.deletion/1", "deleted": [str(path) for path in deleted]})
+    else:
+        for path in deleted:
+            show(f"{path}: deleted")
+    return 0
+
+
 def _rows(recording: Contents, stream: DecodedStream, phase: str) -> Iterator[Rows]:
     """The stream's samples in the phase. Raises InputError, before anything is
     written, where there are none."""

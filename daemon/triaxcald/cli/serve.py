@@ -56,6 +56,9 @@ def serve_command(a: argparse.Namespace) -> int:
         from triaxcald.run.golden_unit import golden_calibration
 
         golden_calibration(station)
+    from triaxcald.signing.station import signing_of
+
+    signing_of(station)
     from triaxcald.service.gate import require_safe
     from triaxcald.service.server import Address, serve
 
@@ -129,7 +132,7 @@ LISTENER_S = 8.0
 def demo_page(a: argparse.Namespace) -> int:
     """A station with two simulated units, its page, and a tray that runs by itself."""
     require_web("demo --page")
-    from triaxcald.demo import demo_effects
+    from triaxcald.demo import demo_effects, make_key
     from triaxcald.files import write_text
     from triaxcald.service.server import Address
     from triaxcald.simulation.tray import load_tray
@@ -146,6 +149,7 @@ def demo_page(a: argparse.Namespace) -> int:
         a.out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{a.out}: {e.strerror}") from e
+    make_key(a.out)
     described = zip(DEMO_SLOTS.items(), buses.items(), demo_effects(a.seed), strict=True)
     for number, ((slot, mounting), (driver, bus), (effect, sizes)) in enumerate(described):
         serials[slot] = str(1001 + number)

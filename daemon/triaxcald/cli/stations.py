@@ -37,6 +37,9 @@ def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     station.require_units()
     from triaxcald.run.attempts import settle_killed
+    from triaxcald.signing.station import signing_of
+
+    signing_of(station)  # a run that cannot sign ends here
     from triaxcald.run.orders import with_serials, works
 
     for killed in settle_killed(station):  # they count as attempts
@@ -132,6 +135,7 @@ def _unit(o: Outcome) -> UnitOfRun:
         device_state=o.device_state,
         outcome=OutcomeDocument.model_validate(o.document),
         outcome_file=_text(o.outcome),
+        signature_file=_text(o.signature),
         records_lost=o.lost,
         verification=None if o.verification is None else Verification.model_validate(o.verification),
     )
@@ -220,7 +224,13 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         show(f"  creeping poses: {creep}")
     for caution in c.cautions:
         show(f"  warning: {tc.text.caution(caution)}")
-    artifacts = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
+    artifacts = {
+        "recording": o.recording,
+        "certificate": o.certificate,
+        "report": o.report,
+        "outcome": o.outcome,
+        "signature": o.signature,
+    }
     for what, path in artifacts.items():
         if path is not None:
             show(f"  {what:<12}{path}")

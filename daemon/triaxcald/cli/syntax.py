@@ -807,7 +807,7 @@ def _add_database(p: argparse.ArgumentParser) -> None:
 
 def _logs(commands: Any) -> None:
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
-    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
+    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|delete|export|import")
     p = add_command(
         parts, "info", "recordings:info_command", "show the contents of a recording", "", "log info rec.mcap"
     )
@@ -823,6 +823,15 @@ def _logs(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("recording", metavar="REC", type=Path)
     p.add_argument("-o", "--output", type=Path, help="default: REC with .recovered before .mcap")
+    add_json(p)
+    p = add_command(
+        parts, "delete", "recordings:delete_command", "delete recordings of a station, and sign that and why",
+        "The outcome stays, and so does the tombstone in the chain.",
+        "log delete old.mcap --station station.toml --reason 'older than ten years'",
+    )  # fmt: skip
+    p.add_argument("recordings", metavar="REC", nargs="+", type=Path)
+    p.add_argument("--station", metavar="STATION.toml", type=Path, required=True, help="whose key signs it")
+    p.add_argument("--reason", metavar="TEXT", required=True)
     add_json(p)
     p = add_command(
         parts, "export", "recordings:export_command", "write the samples as CSV", "", "log export rec.mcap -o rec.csv"

@@ -10,7 +10,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import triaxcal_drivers as td
 from triaxcald.errors import RecordingError
 from triaxcald.files import write_durably
+from triaxcald.recording.schema import RAW
 
 FORMAT = "triaxcal.segments/1"
 SUFFIX = ".segments.json"
@@ -292,12 +293,56 @@ def delete(manifest: Manifest, chosen: Iterable[Surplus]) -> list[Surplus]:
 Document = dict[str, Any]
 
 
+class End(NamedTuple):
+    """The document that a recording ends with, as an attachment."""
+
+    name: str
+    media_type: str
+    time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class SealedContents:
+    """All that a recording of a run holds but its signature: what is signed.
+
+    ``contents`` is the inventory with the last document. ``raw_batches`` counts the
+    messages of raw records, ``raw_chain`` is the head of their hash chain: from 32
+    zero bytes on, each link is the SHA-256 of the link before and of the SHA-256 of
+    the message. ``metadata`` are the records before the last document, ``closing``
+    those after it. ``document`` is the last document.
+    """
+
+    contents: Document
+    raw_batches: int
+    raw_chain: str
+    metadata: Mapping[str, Mapping[str, str]]
+    closing: Mapping[str, Mapping[str, str]]
+    document: bytes
+
+
+class SignatureMade(NamedTuple):
+    """A signature as an attachment."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+Sign = Callable[[SealedContents], AbstractContextManager[SignatureMade]]
+"""Signs a recording. The context lasts until the file is whole and on the disk; if it
+ends with an error, the recording counts as not signed. Raises RecordingError."""
+
+
 class Inventory:
     """Grows with a recording, record by record, in the order of the file."""
 
     def __init__(self) -> None:
+        self.records: dict[str, Mapping[str, str]] = {}
+        """The metadata records by name."""
         self._attachments: list[Document] = []
         self._metadata: list[Document] = []
+        self._raw_batches, self._raw_chain = 0, bytes(hashlib.sha256().digest_size)
         self._topics: dict[str, tuple[int, hashlib._Hash]] = {}
         self._declared: dict[str, set[str]] = {}
 
@@ -309,11 +354,10 @@ class Inventory:
         self._declared.setdefault(topic, set()).add(hashlib.sha256(text).hexdigest())
 
     def attachment(self, name: str, media_type: str, time_ns: int, data: bytes) -> None:
-        self._attachments.append(
-            {"name": name, "media_type": media_type, "time_ns": time_ns, "sha256": hashlib.sha256(data).hexdigest()}
-        )
+        self._attachments.append(_attachment(name, media_type, time_ns, data))
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
+        self.records[name] = dict(record)
         text = "".join(f"{key}\0{value}\0" for key, value in sorted(record.items()))
         self._metadata.append({"name": name, "sha256": hashlib.sha256(text.encode()).hexdigest()})
 
@@ -322,6 +366,9 @@ class Inventory:
         digest.update(struct.pack("<QQQ", log_time_ns, publish_time_ns, len(data)))
         digest.update(data)
         self._topics[topic] = count + 1, digest
+        if topic == RAW:
+            self._raw_batches += 1
+            self._raw_chain = hashlib.sha256(self._raw_chain + hashlib.sha256(data).digest()).digest()
 
     def document(self) -> Document:
         """Attachments in the order of the file, metadata by name, messages by
@@ -336,5 +383,18 @@ class Inventory:
             ],
         }
 
+    def sealed(self, end: End, closing: Mapping[str, Mapping[str, str]]) -> SealedContents:
+        """With the document ``end``, which is not in the inventory, and the metadata
+        records ``closing`` that follow it."""
+        contents = self.document()
+        contents["attachments"].append(_attachment(*end))
+        return SealedContents(
+            contents, self._raw_batches, self._raw_chain.hex(), dict(self.records), {**closing}, end.data
+        )
+
     def _declaration(self, topic: str) -> str:
         return hashlib.sha256("".join(sorted(self._declared.get(topic, ()))).encode()).hexdigest()
+
+
+def _attachment(name: str, media_type: str, time_ns: int, data: bytes) -> Document:
+    return {"name": name, "media_type": media_type, "time_ns": time_ns, "sha256": hashlib.sha256(data).hexdigest()}

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import re
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -21,7 +21,7 @@ import triaxcal_drivers as td
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.files import exists_already, is_of_the_disk, new_file
 from triaxcald.recording import schema
-from triaxcald.recording.manifest import is_manifest
+from triaxcald.recording.manifest import End, Inventory, SealedContents, SignatureMade, is_manifest
 from triaxcald.recording.mcap_records import (
     CHUNK_LIMIT,
     HEAD,
@@ -229,13 +229,15 @@ class Recovery:
 
 class Sealed(NamedTuple):
     """The document that a mended recording ends with, as its last attachment.
-    ``later``: it was not in the recording, which ends before the run did."""
+    ``later``: it was not in the recording, which ends before the run did. ``sign``
+    makes the signature that follows it."""
 
     name: str
     media_type: str
     time_ns: int
     data: bytes
     later: bool = False
+    sign: Callable[[SealedContents], SignatureMade] | None = None
 
 
 def recover(path: Path, out: Path, *, without: Collection[str] = (), sealed: Sealed | None = None) -> Recovery:
@@ -278,6 +280,7 @@ class _Recoverer:
         self._recovery = Recovery(cut_short=True)
         self._channel_ids: dict[int, int] = {}  # from those of the damaged file to those of the new one
         self._digest = schema.RawDigest()
+        self._inventory = Inventory()  # of the new file
         self._first = 0  # running index of the first record
         self._raw_end = 0  # running index after the last known record
         self._written: dict[str, str] = {}  # the metadata record `raw`, if the writer finished the file
@@ -316,9 +319,10 @@ class _Recoverer:
                 self._recovery.attachments_failed += 1
             return
         if isinstance(record, Attachment):
-            if record.name in self._without:
-                return
+            if record.name in self._without or record.name == schema.SIGNATURE_FILE:
+                return  # no signature is of a recording that was mended later
             self._recovery.attachments += 1
+            self._inventory.attachment(record.name, record.media_type, record.log_time, record.data)
             self._mcap.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         elif isinstance(record, Metadata):
             self._metadata(record)
@@ -331,6 +335,8 @@ class _Recoverer:
             return  # the new file has its own
         if record.name != schema.FORMAT_RECORD:  # a wrong byte in it would make the new file unreadable
             self._mcap.add_metadata(record.name, record.metadata)
+            if record.name != schema.RECOVERY_RECORD:
+                self._inventory.metadata(record.name, record.metadata)
         elif record.metadata.get(schema.ENDS_WITH):
             self._digest.ends_with = record.metadata[schema.ENDS_WITH]
         self._first = self._first or schema.first_index({record.name: record.metadata})
@@ -385,6 +391,10 @@ class _Recoverer:
             self._channel_ids[message.channel_id] = self._mcap.register_channel(
                 channel.topic, channel.message_encoding, schema_id, channel.metadata
             )
+            self._inventory.channel(
+                channel.topic, channel.message_encoding, channel.metadata, (kind.name, kind.encoding, kind.data)
+            )
+        self._inventory.message(channel.topic, message.log_time, message.publish_time, message.data)
         self._mcap.add_message(
             self._channel_ids[message.channel_id],
             message.log_time,
@@ -439,18 +449,29 @@ class _Recoverer:
 
     def _write_end(self, name: str) -> None:
         ends_with = {schema.ENDS_WITH: self._digest.ends_with} if self._digest.ends_with else {}
-        self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT} | ends_with)
-        if self._sealed is not None:
-            at = self._sealed.time_ns
-            self._mcap.add_attachment(at, at, self._sealed.name, self._sealed.media_type, self._sealed.data)
-        self._mcap.add_metadata(schema.RAW_RECORD, self._digest.record())
+        own = {"format": schema.FORMAT} | ends_with
+        self._mcap.add_metadata(schema.FORMAT_RECORD, own)
+        self._inventory.metadata(schema.FORMAT_RECORD, own)
+        closing = {schema.RAW_RECORD: self._digest.record()}
         if self._sealed is not None:
             digest = hashlib.sha256(self._sealed.data).hexdigest()
-            self._mcap.add_metadata(schema.END_RECORD, {"name": self._sealed.name, "sha256": digest})
+            closing[schema.END_RECORD] = {"name": self._sealed.name, "sha256": digest}
+        closing[schema.RECOVERY_RECORD] = self._summary(name)
+        if self._sealed is not None:
+            end = End(*self._sealed[:4])
+            self._mcap.add_attachment(end.time_ns, end.time_ns, end.name, end.media_type, end.data)
+            if self._sealed.sign is not None:
+                made = self._sealed.sign(self._inventory.sealed(end, closing))
+                self._mcap.add_attachment(end.time_ns, end.time_ns, made.name, made.media_type, made.data)
+        for record, values in closing.items():
+            self._mcap.add_metadata(record, values)
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+
+    def _summary(self, name: str) -> dict[str, str]:
+        """The record of the recovery."""
         summary = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
         if "sha256" in self._written:
             summary["sha256_when_written"] = self._written["sha256"]
         if self._sealed is not None and self._sealed.later:
             summary[schema.SEALED_LATER] = self._sealed.name
-        self._mcap.add_metadata(schema.RECOVERY_RECORD, summary)
-        self._mcap.finish()  # type: ignore[no-untyped-call]
+        return summary

@@ -31,6 +31,7 @@ ENDS_WITH = "ends_with"  # its key for the name of the document that ends a comp
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
 PHASE_KEY = "phase "  # prefix of its keys with the counts of a phase, which follows
 END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
+SIGNATURE_FILE = "manifest.dsse.json"  # the attachment with the signature, after the document that ends a recording
 SENT = "sent"  # the kind of the event about a frame that a sequence of the profile sent
 IMPORTED = "imported"  # the kind of the event about the log that a recording was imported from
 RECOVERY_RECORD = "recovery"  # the metadata record of a recovered recording

@@ -8,7 +8,8 @@ import re
 import threading
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,17 @@ from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.manifest import SEGMENT_BYTES as SEGMENT_BYTES
 from triaxcald.recording.manifest import SEGMENT_S as SEGMENT_S
-from triaxcald.recording.manifest import Document, Manifest, Retention, Segment, Surplus, delete, manifest_path, surplus
+from triaxcald.recording.manifest import (
+    Document,
+    Manifest,
+    Retention,
+    Segment,
+    Sign,
+    Surplus,
+    delete,
+    manifest_path,
+    surplus,
+)
 from triaxcald.recording.reader import digest_of
 from triaxcald.recording.rebuild import open_manifest, with_last_on_disk
 from triaxcald.recording.writer import Head, RecordingFile, RecordingWriter, ended_because
@@ -251,6 +262,10 @@ def evidence_in(folder: Path) -> EvidenceIndex:
         return index
 
 
+Bury = Callable[[str, str, str], None]
+"""Signs that a file is about to be deleted: its SHA-256, its name and the reason.
+Raises RecordingError, OSError."""
+
 REBUILT = "manifest_rebuilt"  # an event
 AWAY = "nothing was being recorded meanwhile"
 DAMAGED = "what was recorded before is damaged, and nothing was being recorded meanwhile"
@@ -264,11 +279,11 @@ class SegmentedWriter(RecordingWriter):
     ``path`` is the manifest, or an `.mcap` of that name.
 
     Every segment has the attachments written before the first raw record.
-    ``retention`` deletes the oldest segments. ``deleted`` lists them, and so do
-    events in the current segment. The age of a segment is the smaller one of its
-    ages by the clock and by ``steady_ns``, a time that no setting of the clock moves,
-    so a clock set forward deletes nothing. As a context manager, the writer records
-    by an event why it ended.
+    ``retention`` deletes the oldest segments, each after ``bury`` has signed that it
+    does. ``deleted`` lists them, and so do events in the current segment. The age of a
+    segment is the smaller one of its ages by the clock and by ``steady_ns``, a time
+    that no setting of the clock moves, so a clock set forward deletes nothing. As a
+    context manager, the writer records by an event why it ended.
     """
 
     def __init__(
@@ -279,13 +294,14 @@ class SegmentedWriter(RecordingWriter):
         size_bytes: int = SEGMENT_BYTES,
         time_s: float = SEGMENT_S,
         retention: Retention | None = None,
+        bury: Bury | None = None,
         steady_ns: Callable[[], int] = td.host_clock.HOST.now_ns,
         **options: Any,
     ) -> None:
         self.manifest = manifest_path(path)
         self.deleted: list[Surplus] = []
         self._size_bytes, self._time_ns = size_bytes, round(time_s * 1e9)
-        self._retention, self._steady_ns = retention, steady_ns
+        self._retention, self._steady_ns, self._bury = retention, steady_ns, bury
         self._evidence = evidence_in(self.manifest.parent)
         self._began_ns = self._retained_ns = steady_ns()
         self._closed_ns: dict[int, int] = {}  # by number, by the steady clock
@@ -295,7 +311,7 @@ class SegmentedWriter(RecordingWriter):
         """Document that cannot be read; it keeps segments that would be deleted."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
-    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
+    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes], sign: Sign | None = None) -> None:
         raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
 
     @property
@@ -463,12 +479,20 @@ class SegmentedWriter(RecordingWriter):
 
     def _delete(self, chosen: list[Surplus]) -> list[Surplus]:
         """Deletes segments; returns those that were deleted."""
-        gone = delete(self._segments, chosen)
+        gone = delete(self._segments, chosen if self._bury is None else self._buried(chosen, self._bury))
         if gone:
             self._segments = self._segments.without([(one.segment, one.reason) for one in gone])
             self._segments.save()
             self.deleted += gone
         return gone
+
+    def _buried(self, chosen: list[Surplus], bury: Bury) -> Iterator[Surplus]:
+        """Segments whose deletion is signed. One for which nothing is signed stays."""
+        for one in chosen:
+            with suppress(RecordingError, OSError):
+                path = self._segments.path_of(one.segment)
+                bury(one.segment.sha256 or digest_of(path), path.name, one.reason)
+                yield one
 
     def _deleted(self, gone: list[Surplus]) -> schema.Event:
         return self._event("deleted", {"segments": [_detail_of(one) for one in gone]})

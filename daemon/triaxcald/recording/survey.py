@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -25,7 +25,7 @@ from mcap.records import (
 )
 
 from triaxcald.recording import schema
-from triaxcald.recording.manifest import Inventory
+from triaxcald.recording.manifest import End, Inventory, SealedContents
 from triaxcald.recording.mcap_records import HEAD, UnparsedRecord, chunk_data, chunk_records, parse, whole_chunk_head
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import decode_raw
@@ -58,10 +58,28 @@ class Survey:
     inventory: Inventory = field(default_factory=Inventory)
     attachments: list[str] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
+    end: End | None = None
+    """The last document itself."""
+    signature: End | None = None
+    """The signature, which no inventory has."""
+    closing: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    """The metadata records that follow it."""
+    last_ns: int | None = None
+    """The latest time of a message."""
 
     @property
     def last(self) -> str | None:
-        return self.attachments[-1] if self.attachments else None
+        """The last attachment but for a signature, which has its place after it."""
+        return next((name for name in reversed(self.attachments) if name != schema.SIGNATURE_FILE), None)
+
+    @property
+    def signature_is_last(self) -> bool:
+        return self.attachments[-1:] == [schema.SIGNATURE_FILE]
+
+    @property
+    def sealed(self) -> SealedContents | None:
+        """What a signature is of; None without a last document."""
+        return None if self.end is None else self.inventory.sealed(self.end, self.closing)
 
 
 def survey(recording: Recording, end: str) -> Survey:
@@ -128,14 +146,20 @@ class _Surveyor:
         elif isinstance(record, Metadata):
             self._metadata.append(record.name)
             self._indices.append(MetadataIndex(offset=unparsed.offset, length=length, name=record.name))
-            if record.name not in AFTER_THE_END:
+            if record.name in AFTER_THE_END:
+                self._found.closing[record.name] = record.metadata
+            else:
                 self._found.inventory.metadata(record.name, record.metadata)
 
     def _attachment(self, record: Attachment) -> None:
         self._found.attachments.append(record.name)
         if record.create_time != record.log_time:
             self._counts["times", record.name] += 1
-        if record.name != self._end:
+        if record.name == self._end:
+            self._found.end = End(record.name, record.media_type, record.log_time, record.data)
+        elif record.name == schema.SIGNATURE_FILE:
+            self._found.signature = End(record.name, record.media_type, record.log_time, record.data)
+        else:
             self._found.inventory.attachment(record.name, record.media_type, record.log_time, record.data)
 
     # Chunks and their records.
@@ -172,6 +196,7 @@ class _Surveyor:
         if times:
             first, last = self._times_ns or (times[0], times[0])
             self._times_ns = min(first, *times), max(last, *times)
+            self._found.last_ns = self._times_ns[1]
 
     def _declare(self, known: dict[int, Any], number: int, record: Any) -> None:
         if known.setdefault(number, record) != record:

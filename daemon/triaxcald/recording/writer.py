@@ -27,7 +27,7 @@ from triaxcald.errors import DiskError, ProvisionError, RecordingError, TwoAnswe
 from triaxcald.files import exists_already, require_new, synchronise
 from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording import disk, schema
-from triaxcald.recording.manifest import Document, Inventory
+from triaxcald.recording.manifest import Document, End, Inventory, Sign
 from triaxcald.recording.schema import encode_raw
 
 # The file of a recording while it is written, by one thread.
@@ -82,7 +82,7 @@ class RecordingFile:
         self._head, self._clock_ns, self._sync_ns = head, clock_ns, round(sync_s * 1e9)
         self._chunks = 0
         self._waiting_ns: int | None = None  # when the oldest record not yet flushed was written
-        self._end: dict[str, str] = {}
+        self._end: End | None = None
         self._begun_ns: int | None = self.sound_ns  # None once the file says so
         try:
             self._file = _create(path)
@@ -146,8 +146,10 @@ class RecordingFile:
     def seal(self, time_ns: int, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
         """The last attachment, made from the inventory of all before it."""
         data = make(self.inventory.document())
-        self.attach(time_ns, name, media_type, data)
-        self._end = {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
+        self._end = End(name, media_type, time_ns, data)
+        self._mcap.flush()  # type: ignore[no-untyped-call]  # as `attach`, but for the inventory, which is complete
+        self._mcap.add_attachment(time_ns, time_ns, name, media_type, data)
+        self.flush()
 
     def flush(self) -> None:
         """The operating system has everything; now and then, the disk too."""
@@ -187,14 +189,26 @@ class RecordingFile:
         free = disk.free_bytes(self._file.fileno())
         return free if free is not None and free < disk.END_BYTES + disk.CHUNK_BYTES * self._chunks else None
 
-    def finish(self) -> None:
-        """The indexes and the end of the file, which is on the disk then, and
-        closed."""
+    def finish(self, sign: Sign | None = None) -> None:
+        """The signature of a sealed recording, the indexes and the end of the file,
+        which is on the disk then, and closed. Raises what ``sign`` raises."""
         if self._begun_ns is not None:
             self._tell_begun(self._begun_ns)
-        self._mcap.add_metadata(schema.RAW_RECORD, self.digest.record())
-        if self._end:
-            self._mcap.add_metadata(schema.END_RECORD, self._end)
+        closing = {schema.RAW_RECORD: self.digest.record()}
+        if self._end is not None:
+            digest = hashlib.sha256(self._end.data).hexdigest()
+            closing[schema.END_RECORD] = {"name": self._end.name, "sha256": digest}
+        if sign is None or self._end is None:
+            self._write_end(closing)
+            return
+        with sign(self.inventory.sealed(self._end, closing)) as made:
+            at_ns = self._end.time_ns
+            self._mcap.add_attachment(at_ns, at_ns, made.name, made.media_type, made.data)
+            self._write_end(closing)
+
+    def _write_end(self, closing: Mapping[str, Mapping[str, str]]) -> None:
+        for name, record in closing.items():
+            self._mcap.add_metadata(name, dict(record))
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -346,6 +360,7 @@ class RecordingWriter:
         self._unreported: list[tuple[str, int, int]] = []  # topic, first, records
         self._failure: RecordingError | None = None
         self._closed = self._finished = False
+        self._sign: Sign | None = None
         self._dropped_s = -math.inf  # when raw records were last lost
         self._order = threading.Lock()
         self._room = threading.Semaphore(queue_batches)
@@ -447,10 +462,11 @@ class RecordingWriter:
         self._attached.add(name)
         self._jobs.put(partial(self._write_attachment, self._clock_ns(), name, media_type, data))
 
-    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
-        """Write the last attachment, made from the inventory of the file before it, and
-        close the recording."""
+    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes], sign: Sign | None = None) -> None:
+        """Write the last attachment, made from the inventory of the file before it,
+        ``sign`` it if given, and close the recording."""
         self.check()
+        self._sign = sign
         time_ns = self._clock_ns()
 
         def write() -> None:
@@ -582,7 +598,7 @@ class RecordingWriter:
         return None if self._provisional else self._file.sound_ns
 
     def _finish(self) -> None:
-        self._file.finish()
+        self._file.finish(self._sign)
         self._finished = True
 
     def _next_job(self) -> Callable[[], None] | None:

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -39,9 +39,12 @@ from triaxcald.outcome import (
 from triaxcald.provision.journal import FOLDER as JOURNALS
 from triaxcald.provision.journal import parse
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
+from triaxcald.recording.manifest import SealedContents, SignatureMade
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import Sealed, recover
+from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.recording.survey import survey
+from triaxcald.signing.station import signing_of
 from triaxcald.software import software
 from triaxcald.station.config import Limits, Station
 from triaxcald.station.lock import fcntl
@@ -306,14 +309,15 @@ def _has_outcome(folder: Path, file: AttemptFile, recording: Path | None) -> boo
         return any(_run_in(path) == file.attempt.run for path in folder.glob(f"{slot}-*{SUFFIX}"))
     try:
         with Recording.open(recording) as finished:
-            held = {name: finished.attachments[name] for name in (*PAPERS, ATTACHMENT) if name in finished.attachments}
+            names = (*PAPERS, SIGNATURE_FILE, ATTACHMENT)
+            held = {name: finished.attachments[name] for name in names if name in finished.attachments}
     except (RecordingError, InputError):
         return False
     if not _is_final(file, held.get(ATTACHMENT)):
         return False
     for name, data in held.items():
         path = recording.with_suffix(f".{name}")
-        if not path.exists() or (name == ATTACHMENT and file.outcome is not None):
+        if not path.exists() or (name != CERTIFICATE and name != REPORT and file.outcome is not None):
             write_text(path, data.decode())
     return True
 
@@ -380,12 +384,26 @@ def _mended(station: Station, file: AttemptFile, attempt: Attempt, recording: Pa
                 contents = survey(found, ATTACHMENT).inventory.document()
             document = _document(station, file, attempt, contents)
             outcome = to_text(document).encode()
-        sealed = Sealed(ATTACHMENT, "application/json", _ended_ns(file), outcome, later=document is not None)
-        recovery = recover(recording, mended, without=without, sealed=sealed)
-        if not recovery.lossless:  # what could not be read may be read by somebody else
-            _keep(recording)
-        os.replace(mended, recording)
-        synchronise(recording.parent)
+        signing = signing_of(station)
+        with ExitStack() as until_there:
+            signed: list[SignatureMade] = []
+
+            def sign(contents: SealedContents) -> SignatureMade:
+                assert signing is not None
+                signed.append(until_there.enter_context(signing.sign(contents)))
+                return signed[0]
+
+            later = document is not None
+            sealed = Sealed(
+                ATTACHMENT, "application/json", _ended_ns(file), outcome, later, None if signing is None else sign
+            )
+            recovery = recover(recording, mended, without=without, sealed=sealed)
+            if not recovery.lossless:  # what could not be read may be read by somebody else
+                _keep(recording)
+            os.replace(mended, recording)
+            synchronise(recording.parent)
+        for made in signed:
+            write_text(recording.with_suffix(f".{made.name}"), made.data.decode())
     except OSError as e:
         raise DiskError(f"{recording}: cannot be mended: {e.strerror}") from e
     finally:

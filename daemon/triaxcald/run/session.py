@@ -35,11 +35,12 @@ from triaxcald.utc import file_stamp
 @dataclass(frozen=True)
 class Segments:
     """A recording in segments of so many bytes and seconds, of which
-    ``retention`` takes the oldest away."""
+    ``retention`` takes the oldest away, each after ``bury`` has signed that it does."""
 
     size_bytes: int = SEGMENT_BYTES
     time_s: float = SEGMENT_S
     retention: Retention | None = None
+    bury: Callable[[str, str, str], None] | None = None
 
 
 def new_writer(path: Path, segments: Segments | None, **settings: Any) -> RecordingWriter:

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Generator, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Awaitable, Callable, Generator, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -45,6 +45,8 @@ from triaxcald.provision.procedure import Provisioning, to_its_end
 from triaxcald.provision.registers import RegisterImage, leaves_open, require_readings_before
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.raw_to_poses import Pipeline
+from triaxcald.recording.manifest import SealedContents, SignatureMade
+from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
@@ -58,6 +60,7 @@ from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.run.tray_progress import TrayProgress
 from triaxcald.run.write_back import VERIFICATION_FILE, WriteBack, corrected
 from triaxcald.schema.codes import Stage
+from triaxcald.signing.station import StationSigning, signing_of
 from triaxcald.software import new_run_id, software
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, SerialsSeen, Station
@@ -91,6 +94,7 @@ class Outcome:
     certificate: Path | None = None
     report: Path | None = None
     outcome: Path | None = None
+    signature: Path | None = None
     certified: Certified | None = None
     verification: tc.interchange.Document | None = None
     provisioned: Provisioning | None = None
@@ -155,6 +159,8 @@ class UnitRun(UnitSession):
         self._golden_verification: tc.interchange.Document | None = None
         self._at_start: dict[str, bytes] | None = None
         self._document: tc.interchange.Document | None = None
+        self._signing: StationSigning | None = None
+        self._envelope: bytes | None = None
         self._lost = 0
 
     async def run(self) -> Outcome:
@@ -229,6 +235,8 @@ class UnitRun(UnitSession):
         """Note the attempt on the disk, and wait until all units of the tray have.
         Raises InputError, DiskError."""
         work = self._attempt.work
+        if (signing := await asyncio.to_thread(signing_of, self.station)) is not None:
+            self._signing = replace(signing, clock_ns=self.clock_ns)
         if work.serial is not None:
             await self._count(work.serial)
         self._attempt_file = await asyncio.to_thread(
@@ -338,15 +346,23 @@ class UnitRun(UnitSession):
 
     def _finalize(self, writer: RecordingWriter, ending: Ending) -> None:
         """Store the outcome as the last attachment, with the inventory of everything
-        before it, and close the recording. From then on the outcome is final."""
+        before it, sign it all, and close the recording. From then on the outcome is
+        final."""
         made: list[tc.interchange.Document] = []
 
         def make(contents: tc.interchange.Document) -> bytes:
             made.append(self._outcome_document(ending, contents))
             return to_text(made[0]).encode()
 
-        writer.seal(ATTACHMENT, "application/json", make)
+        writer.seal(ATTACHMENT, "application/json", make, None if self._signing is None else self._sign)
         self._document = made[0]
+
+    @contextmanager
+    def _sign(self, contents: SealedContents) -> Iterator[SignatureMade]:
+        assert self._signing is not None
+        with self._signing.sign(contents) as made:
+            yield made
+        self._envelope = made.data
 
     def _outcome_document(self, ending: Ending, contents: tc.interchange.Document | None) -> tc.interchange.Document:
         certificate = self._certified.document if self._certified else None
@@ -396,14 +412,16 @@ class UnitRun(UnitSession):
         return text.unfinished(self._open_journal, self.name, self.station.path) if self._open_journal else None
 
     def _write_artifacts(self) -> None:
-        """Write the files beside the closed recording: certificate, report, and the
-        outcome last."""
+        """Write the files beside the closed recording: certificate, report, signature,
+        and the outcome last."""
         if self._recording is None:
             if self._document is not None:  # the attempt came to no recording
                 stem = f"{self.name}-{in_a_name(self._serial or 'unknown')}-{file_stamp(self.clock_ns())}"
                 self._paths[ATTACHMENT] = write_new(self.station.folder, stem, SUFFIX, to_text(self._document))
             return
         artifacts = dict(self._artifacts)
+        if self._envelope is not None:
+            artifacts[SIGNATURE_FILE] = self._envelope.decode()
         if self._document is not None:
             artifacts[ATTACHMENT] = to_text(self._document)
         for name, content in artifacts.items():
@@ -427,6 +445,7 @@ class UnitRun(UnitSession):
             certificate=self._paths.get(CERTIFICATE),
             report=self._paths.get(REPORT),
             outcome=self._paths.get(ATTACHMENT),
+            signature=self._paths.get(SIGNATURE_FILE),
             certified=self._certified,
             verification=self._verification,
             provisioned=back.provisioning if back else None,

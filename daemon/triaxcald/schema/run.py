@@ -42,6 +42,9 @@ class UnitOfRun(tc.schema.Model):
     ]
     outcome: Annotated[Outcome, Field(description="the [`triaxcal.outcome/1`](outcome.md)")]
     outcome_file: Annotated[tc.schema.Text | None, Field(description="its path; `null` without a file")]
+    signature_file: Annotated[
+        tc.schema.Text | None, Field(description="path of the signature; `null` where the station has no key")
+    ] = None
     records_lost: Annotated[int, Field(description="number of raw records that did not reach the disk")]
     verification: Annotated[
         Verification | None,

@@ -25,6 +25,7 @@ from triaxcald.service import golden
 from triaxcald.service.desk import Desk, Scanned
 from triaxcald.service.errors import ApiError, Problem
 from triaxcald.service.stream import Stream
+from triaxcald.signing.station import signing_of
 from triaxcald.station.config import Station, check_lines
 from triaxcald.utc import iso_time
 from triaxcald.work import wrong
@@ -290,6 +291,7 @@ class Floor:
             given.setdefault("operator", person)
         scanned = [(slot, serial) for slot, serial in due.items() if serial is not None]
         try:
+            await asyncio.to_thread(signing_of, station)
             station = with_serials(station, scanned)
             work = await asyncio.to_thread(works, station, given)
             check_lines(station.places, where=str(station.path))

@@ -224,6 +224,34 @@ class Receiver(td.Strict):
         return self
 
 
+class Token(td.Strict):
+    """A device that holds keys, by PKCS #11."""
+
+    module: Annotated[PathText, Field(description="library of the device's maker")]
+    token: Annotated[str, Field(min_length=1, description="label of the token")]
+
+
+class Sign(td.Strict):
+    """By which key the recordings of runs are signed. Without it, by the only key in
+    the folder `keys`, if there is one."""
+
+    key: Annotated[str | None, Field(pattern=NAME, description="name of the key")] = None
+    folder: Annotated[PathText | None, Field(description="with the keys, beside the station file; default: keys")] = (
+        None
+    )
+    passphrase_file: Annotated[
+        PathText | None,
+        Field(
+            description="file with the key's passphrase, beside the station file; default: the environment's "
+            "TRIAXCAL_KEY_PASSPHRASE"
+        ),
+    ] = None
+    pkcs11: Annotated[Token | None, Field(description="the key is in this device, and the passphrase its PIN")] = None
+    timestamp: Annotated[
+        str | None, Field(pattern=r"^https?://\S+$", description="URL of a time-stamping authority (RFC 3161)")
+    ] = None
+
+
 class Unit(td.Strict):
     name: Annotated[str, Field(pattern=NAME)]
     profile: Annotated[
@@ -282,6 +310,7 @@ class StationFile(td.Strict):
     fixture: Fixture = Fixture()
     rules: Rules = Rules()
     work: WorkDefaults = WorkDefaults()
+    sign: Annotated[Sign | None, Field(description="by which key recordings are signed")] = None
     deliver: Annotated[tuple[Receiver, ...], Field(description="receivers of each result, for the service alone")] = ()
     buses: Annotated[
         tuple[Bus, ...],

@@ -262,3 +262,16 @@ async def test_who_has_signed_in_is_the_operator_unless_another_is_named(
         await over(floor)
     (path,) = tmp_path.glob("*.outcome.json")
     assert json.loads(path.read_text())["work"]["operator"] == expected
+
+
+async def test_a_tray_that_cannot_be_signed_does_not_start_and_leaves_the_scans(
+    make_station: Callable[..., Station], tmp_path: Path
+) -> None:
+    async with at_work(make_station()) as (floor, _):
+        await floor.scan("1001")
+        (tmp_path / "keys").mkdir()
+        (tmp_path / "keys" / "line-1.key").write_text("no key")  # since the service began
+        with pytest.raises(ApiError) as e:
+            await floor.start(None)
+        assert e.value.problem is Problem.INVALID
+        assert (await floor.scan("1002"))["slot"] == "b"
