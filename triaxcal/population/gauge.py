@@ -22,7 +22,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import chi2_ppf, f_sf
@@ -38,6 +38,13 @@ over that of the measurement."""
 DRAWS = 2**14
 """Of the chi-squares of the generalised intervals: their ends are known to one in a
 thousand."""
+APPROXIMATE_DRAWS = 2**12
+"""Of intervals that are approximate."""
+BOUND = 1.96
+"""Standard errors from a variance that may be zero to the end of its interval."""
+DOF_LEAST = 1.0
+"""Of a variance that is surely above zero: below 1 its standard error is larger than
+√2 of it."""
 APPRAISERS_MOST = 200
 """A matrix of so many is solved a thousand times within a minute."""
 LEAST_SHARE = 1e-8
@@ -83,10 +90,10 @@ class Component:
 class GaugeStudy:
     """``components`` by name: `repeatability`, `reproducibility` (with the
     interaction), `appraiser`, `interaction` (absent where pooled or not separable),
-    `gauge` (repeatability and reproducibility), `part`, `total`. ``grr`` is the standard
-    deviation of the gauge over the total, with its interval; ``categories`` the number
-    of distinct categories, None without a scatter of the gauge. ``anova`` has the rows
-    of the full model, empty for REML."""
+    `gauge` (repeatability and reproducibility), `part`, `total`. ``grr`` is the
+    standard deviation of the gauge over the total, with its interval; ``categories``
+    the number of distinct categories, None without a scatter of the gauge. ``anova``
+    has the rows of the full model, empty for REML."""
 
     method: Method
     parts: int
@@ -237,10 +244,8 @@ def _anova(cells: _Cells) -> tuple[Source, ...]:
 
 @cache
 def _chi_squares(dofs: tuple[int, ...]) -> list[Floats]:
-    """Draws of independent chi-squares, evenly spread by an additive recurrence: the
-    same in every run."""
-    steps = (1 / _ROOT) ** np.arange(1, len(dofs) + 1)
-    place = (0.5 + np.arange(1, DRAWS + 1)[:, None] * steps) % 1.0
+    """Draws of independent chi-squares."""
+    place = _places(len(dofs), DRAWS)
     return [np.asarray(chi2_ppf(place[:, i], dof)) for i, dof in enumerate(dofs)]
 
 
@@ -362,10 +367,8 @@ class _Likelihood:
         def deviance(log: NDArray[np.float64]) -> float:
             return self.log(variances(log))
 
-        # Once from equal shares, once from a measurement that scatters most.
-        starts = ([-1.5] * len(names), [-0.2] + [-5.0] * (len(names) - 1))
-        ways = [minimize(deviance, at, method="L-BFGS-B", bounds=[(floor, most)] * len(names)) for at in starts]
-        best = min(ways, key=lambda found: float(found.fun))
+        start = [min(max(math.log(of / self._scale), floor), most) for of in self._start(names)]
+        best = minimize(deviance, start, method="L-BFGS-B", bounds=[(floor, most)] * len(names))
         # L-BFGS-B stops where its numerical slopes end; the simplex goes on from there.
         log = minimize(
             deviance, [float(x) for x in best.x], method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9}
@@ -374,47 +377,70 @@ class _Likelihood:
         least = self._scale * math.e * LEAST_SHARE
         return {name: 0.0 if of <= least and name != "repeatability" else of for name, of in found.items()}
 
+    def _start(self, names: tuple[str, ...]) -> list[float]:
+        """By the scatter of the cells of a part, in equal shares, and of the parts."""
+        c = self._cells
+        own = np.bincount(c.part, c.mean) / np.bincount(c.part)
+        inside = float(np.sum((c.mean - own[c.part]) ** 2)) + c.within
+        inside = max(inside / (c.measurements - c.parts), LEAST_SHARE * self._scale)
+        between = max(float(own.var(ddof=1)), LEAST_SHARE * self._scale)
+        return [between if name == "part" else inside / (len(names) - 1) for name in names]
+
     def draws(self, found: dict[str, float]) -> dict[str, Floats]:
         """Values that the variances may have: scaled inverse chi-squares with the
-        degrees of freedom of Satterthwaite, 2 v² / var(v), at most those of the data;
-        of a variance that is zero, halves of a normal distribution."""
+        degrees of freedom of Satterthwaite, 2 v² / var(v), at most those of the data.
+        Of a variance that may be zero, a normal distribution that ends at zero, with
+        the upper bound of the likelihood."""
         c = self._cells
         error = self._errors(found)
         most = {"part": c.parts - 1, "appraiser": max(c.appraisers - 1, 1)}
         spread: dict[str, Floats] = {}
-        places = _places(len(found))
+        places = _places(len(found), APPROXIMATE_DRAWS)
         for i, (name, variance) in enumerate(found.items()):
-            if variance <= 0.0:
-                spread[name] = error[name] * np.maximum(np.asarray(special.ndtri(places[:, i])), 0.0)
+            dof = 2 * (variance / error[name]) ** 2 if variance > 0 else 0.0
+            if dof < DOF_LEAST:
+                reach = (self._upper(found, name) - variance) / BOUND
+                spread[name] = np.maximum(variance + reach * np.asarray(special.ndtri(places[:, i])), 0.0)
                 continue
-            dof = min(2 * variance**2 / error[name] ** 2, most.get(name, c.measurements - 1))
-            spread[name] = variance * dof / np.asarray(chi2_ppf(places[:, i], max(dof, 0.2)))
+            dof = min(dof, most.get(name, c.measurements - 1))
+            spread[name] = variance * dof / np.asarray(chi2_ppf(places[:, i], dof))
         return spread
 
     def _errors(self, found: dict[str, float]) -> dict[str, float]:
-        """Standard errors of the variances, by the curvature of the likelihood."""
-        names = [*found]
+        """Standard errors of the variances that are not zero, by the curvature of the
+        likelihood."""
+        names = [name for name, of in found.items() if of > 0]
         at = np.array([found[name] for name in names])
-        step = np.maximum(0.02 * at, 1e-3 * self._scale * np.where(at > 0, 1e-3, 1.0))
+        step, n = 0.02 * at, len(names)
 
         def log(moved: Floats) -> float:
-            return self.log(dict(zip(names, np.maximum(moved, 1e-12 * self._scale).tolist(), strict=True)))
+            return self.log(found | dict(zip(names, moved.tolist(), strict=True)))
 
-        n = len(names)
         curvature = np.zeros((n, n))
-        base = np.maximum(at, step)  # a variance of zero is looked at from above
         for i in range(n):
             for j in range(i, n):
                 ei, ej = step * (np.arange(n) == i), step * (np.arange(n) == j)
-                second = log(base + ei + ej) - log(base + ei - ej) - log(base - ei + ej) + log(base - ei - ej)
+                second = log(at + ei + ej) - log(at + ei - ej) - log(at - ei + ej) + log(at - ei - ej)
                 curvature[i, j] = curvature[j, i] = second / (8 * step[i] * step[j])
-        covariance = np.linalg.pinv(curvature, hermitian=True)
-        fallback = np.sqrt(2 / np.maximum(np.diag(curvature), 1e-300))
-        variance = np.diag(covariance)
-        own = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), fallback)
-        return dict(zip(names, own.tolist(), strict=True))
+        variance = np.diag(np.linalg.pinv(curvature, hermitian=True))
+        own = 1 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        errors = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), own)
+        return dict(zip(names, errors.tolist(), strict=True))
+
+    def _upper(self, found: dict[str, float], name: str) -> float:
+        """Where the likelihood has fallen by that of `BOUND` standard errors."""
+        best = self.log(found)
+
+        def excess(log: float) -> float:
+            return self.log(found | {name: self._scale * math.exp(log)}) - best - BOUND**2
+
+        low, high = math.log(max(found[name] / self._scale, LEAST_SHARE)), 12.0
+        if excess(low) > 0:
+            return self._scale * math.exp(low)
+        return self._scale * math.exp(high if excess(high) < 0 else float(brentq(excess, low, high, xtol=1e-3)))
 
 
-def _places(dimensions: int) -> Floats:
+def _places(dimensions: int, draws: int) -> Floats:
+    """Evenly spread in a unit cube by an additive recurrence, the same each time."""
     steps = (1 / _ROOT) ** np.arange(1, dimensions + 1)
-    return (0.5 + np.arange(1, DRAWS + 1)[:, None] * steps) % 1.0
+    return np.asarray((0.5 + np.arange(1, draws + 1)[:, None] * steps) % 1.0)
