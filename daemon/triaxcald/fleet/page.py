@@ -160,7 +160,7 @@ def _signals(product: Mapping[str, Any]) -> Iterator[str]:
 def _gauges(product: Mapping[str, Any]) -> Iterator[str]:
     """The factor that matters most."""
     for figure in product["figures"]:
-        worst = max(figure["gauge"], key=lambda study: study["grr"], default=None)
+        worst = _worst(figure)
         if worst is not None and worst["grr"] > GAUGE_FAILS and figure["name"] in TITLES:
             by = f" (gauge study by {worst['factor']})" if worst["factor"] else ""
             yield f"{title_of(figure['name'])}: the measurement makes {percent(worst['grr'])} of the scatter{by}."
@@ -209,9 +209,16 @@ def gauge_table(product: Mapping[str, Any]) -> dict[str, Any]:
     return {"factors": known, "rows": [_gauge_row(figure, known) for figure in studied]}
 
 
+def _worst(figure: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The study by the factor that matters most; that of repetition where there is no
+    factor."""
+    studies = [study for study in figure["gauge"] if study["factor"]] or figure["gauge"]
+    return max(studies, key=lambda study: study["grr"], default=None)
+
+
 def _gauge_row(figure: Mapping[str, Any], factors: Sequence[str]) -> dict[str, Any]:
     by = {study["factor"]: study for study in figure["gauge"]}
-    worst = max(figure["gauge"], key=lambda study: study["grr"])
+    worst = _worst(figure) or {}
     alone = by.get(None, worst)["components"]
     scale = Scale.of(np.array([alone["part"]["sd"], alone["repeatability"]["sd"]]), figure["unit"])
 
@@ -245,7 +252,7 @@ def _drift_row(figure: Mapping[str, Any]) -> dict[str, Any]:
         "drift": of,
         "change": digits(of["rate"] * time * scale.factor, 2),
         "interval": [None if end is None else end * time * scale.factor for end in (low, high)],
-        "trend": tc.rounding.concise(trend, error),
+        "trend": f"{digits(trend, 2)} ± {digits(error, 2)}",
         "start": digits(of["start_to_start"] * scale.factor, 2),
     }
 

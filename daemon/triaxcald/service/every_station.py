@@ -15,8 +15,8 @@ from triaxcald.store import TIMES
 
 def runs_of_every_station(url: str, *, since_us: int | None, until_us: int | None) -> list[tuple[Any, ...]]:
     """Rows with the cells of `NAMES` and `TIMES`, in the order of time; ``since_us``
-    and ``until_us`` as in `RunFilter`. Nothing is written. Raises InputError for a URL that
-    is none, and for a database without our tables; DatabaseError."""
+    and ``until_us`` as in `RunFilter`. Nothing is written. Raises InputError for a URL
+    that is none, and for a database without our tables; DatabaseError."""
     run = tables.shared_run
     query = select(*(run.c[name] for name in (*NAMES, *TIMES))).order_by(run.c.at_us, run.c.outcome)
     if since_us is not None:
