@@ -34,7 +34,9 @@ class Capability:
     outside_interval: tuple[float, float] | None
 
 
-def capability(values: Floats, low: float | None = None, high: float | None = None, level: float = LEVEL) -> Capability:
+def capability_of(
+    values: Floats, low: float | None = None, high: float | None = None, level: float = LEVEL
+) -> Capability:
     """Of ``values`` (n,) against a lower or an upper limit, or both. The interval is
     exact for a normal distribution with one limit (noncentral t); with two it is that
     of Bissell (Applied Statistics 39 (1990) 331). Raises InvalidData for limits in the

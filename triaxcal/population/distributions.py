@@ -4,7 +4,7 @@ quantiles, normality, outliers, and tests that outliers do not decide."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -186,17 +186,3 @@ def holm(p_values: Sequence[float]) -> list[float]:
     adjusted = np.empty(len(p))
     adjusted[order] = np.maximum.accumulate(steps)
     return list(adjusted.tolist())
-
-
-def compared(figures: Mapping[str, Floats], factors: Mapping[str, Ints]) -> dict[tuple[str, str], Heterogeneity]:
-    """Every figure (n,), NaN for a gap, by every factor: groups of the same n units,
-    negative where a unit belongs to none. By figure and factor, where there are two
-    groups or more; the p-values are not adjusted."""
-    found = {}
-    for figure, values in figures.items():
-        known = np.isfinite(values)
-        for factor, group in factors.items():
-            inside = known & (group >= 0)
-            if (one := heterogeneity(values[inside], group[inside])) is not None:
-                found[figure, factor] = one
-    return found

@@ -14,7 +14,7 @@ differences between successive measurements of each unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -74,7 +74,7 @@ class Drift:
         return q * (time if self.movement is Movement.RANDOM_WALK else time**2)
 
 
-def drift(unit: Ints, time: Floats, values: Floats, standard_errors: Floats, level: float = LEVEL) -> Drift | None:
+def drift_of(unit: Ints, time: Floats, values: Floats, standard_errors: Floats, level: float = LEVEL) -> Drift | None:
     """From measurements (n,) of units numbered by ``unit``, at ``time``, with standard
     errors; NaN counts as 0. None below `CHANGES_LEAST` differences, or where none took
     time. Raises InvalidData for shapes that differ."""
@@ -334,14 +334,6 @@ def sphere() -> Floats:
     z, turn = 1 - 2 * i / DIRECTIONS, math.pi * (1 + math.sqrt(5)) * i
     across = np.sqrt(1 - z**2)
     return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
-
-
-def drifts(
-    unit: Ints, time: Floats, values: Mapping[str, Floats], standard_errors: Mapping[str, Floats]
-) -> dict[str, Drift]:
-    """Of each figure that has one."""
-    found = {name: drift(unit, time, of, standard_errors[name]) for name, of in values.items()}
-    return {name: one for name, one in found.items() if one is not None}
 
 
 def change_after(of: Drift, time: float, probability: float = 0.95) -> float:

@@ -290,7 +290,7 @@ def _begun(signals: Sequence[int]) -> list[int]:
 def _capability(values: tc.Floats, high: float | None) -> dict[str, Any] | None:
     if high is None:
         return None
-    of = population.capability(values, None, high)
+    of = population.capability_of(values, None, high)
     return {
         "high": high,
         "outside": of.outside,
@@ -385,7 +385,7 @@ def _drift(fleet: Fleet, name: str) -> population.Drift | None:
     if not len(rows):
         return None
     scale = abs(float(np.median(figure.values[rows]))) if name.startswith("scale_factor") else 1.0
-    return population.drift(
+    return population.drift_of(
         fleet.unit[rows], fleet.days[rows], figure.values[rows] / (scale or 1.0), figure.errors[rows] / (scale or 1.0)
     )
 

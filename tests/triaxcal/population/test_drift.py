@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
-from triaxcal.population import Drift, Movement, Moving, Part, drift, recalibration_interval
+from triaxcal.population import Drift, Movement, Moving, Part, drift_of, recalibration_interval
 
 UNITS, TIMES = 30, 4
 
@@ -28,7 +28,7 @@ def world(
 
 
 def found(seed: int, **of: float) -> Drift:
-    one = drift(*world(seed, **of))
+    one = drift_of(*world(seed, **of))
     assert one is not None
     return one
 
@@ -65,7 +65,7 @@ def test_without_a_movement_the_rate_reaches_down_to_zero() -> None:
 def test_one_time_between_all_measurements_does_not_tell_starts_from_drift() -> None:
     rng = np.random.default_rng(3)
     unit, time = np.repeat(np.arange(40), 2), np.tile([0.0, 10.0], 40)
-    one = drift(unit, time, rng.normal(0, 1, 80), np.zeros(80))
+    one = drift_of(unit, time, rng.normal(0, 1, 80), np.zeros(80))
     assert one is not None
     assert not one.separable
     assert one.start_to_start == 0.0
@@ -74,10 +74,10 @@ def test_one_time_between_all_measurements_does_not_tell_starts_from_drift() -> 
 
 
 def test_too_few_changes_state_no_drift() -> None:
-    assert drift(np.array([0, 0, 1, 1]), np.arange(4.0), np.arange(4.0), np.zeros(4)) is None
-    assert drift(np.repeat([0, 1, 2], 3), np.zeros(9), np.arange(9.0), np.zeros(9)) is None
+    assert drift_of(np.array([0, 0, 1, 1]), np.arange(4.0), np.arange(4.0), np.zeros(4)) is None
+    assert drift_of(np.repeat([0, 1, 2], 3), np.zeros(9), np.arange(9.0), np.zeros(9)) is None
     with pytest.raises(InvalidData):
-        drift(np.zeros(2, dtype=int), np.zeros(3), np.zeros(3), np.zeros(3))
+        drift_of(np.zeros(2, dtype=int), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 # How long a calibration lasts.
