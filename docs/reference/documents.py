@@ -20,6 +20,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Observation
 from triaxcald.schema.certificate import Certificate
 from triaxcald.schema.codes import Code, Stage, Verdict
 from triaxcald.schema.event import KINDS, Event, Head
+from triaxcald.schema.fleet import FleetDocument
 from triaxcald.schema.outcome import Outcome
 from triaxcald.schema.profile_check import Fault, ProfileCheck
 from triaxcald.schema.quality import Chart, Quality
@@ -46,6 +47,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "station-state": StationState,
     "quality": Quality,
     "chart": Chart,
+    "fleet": FleetDocument,
     "result": Result,
     "profile-check": ProfileCheck,
 }
@@ -174,6 +176,13 @@ The [service](../how-to/run-a-station.md) answers GET `/api/1/quality` by `triax
 Made from the models in `daemon/triaxcald/schema/quality.py` by `docs/reference/documents.py`; JSON Schema of [quality](quality.schema.json) and [chart](chart.schema.json).
 
 """  # noqa: E501
+FLEET = """# Fleet
+
+`triaxcal fleet --json` prints `triaxcal.fleet/1` ([how to](../how-to/learn-from-many-units.md)). A unit counts once, with its last run that has the figure; gauge studies and drifts take all runs of units that were measured more than once. Intervals are of 95 %.
+
+Made from the models in `daemon/triaxcald/schema/fleet.py` by `docs/reference/documents.py`; [JSON Schema](fleet.schema.json).
+
+"""  # noqa: E501
 CHART = """
 ## Chart
 
@@ -215,6 +224,7 @@ def pages() -> dict[Path, str]:
         "event": _event(),
         "results": RESULTS + _keys(Results),
         "station-state": STATION_STATE + _keys(StationState) + "\n## State of a slot\n\n" + _words("state", SlotIs),
+        "fleet": FLEET + _keys(FleetDocument),
         "quality": QUALITY + _keys(Quality) + CHART + _keys(Chart),
         "result": RESULT + _keys(Result),
         "profile-check": PROFILE_CHECK + _keys(ProfileCheck) + "\n## Problems\n\n" + _words("code", Fault),

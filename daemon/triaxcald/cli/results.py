@@ -9,7 +9,7 @@ import io
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from datetime import date
 from pathlib import Path
@@ -42,20 +42,15 @@ SAID = (Code.WITHIN_LIMITS, Code.NO_LIMIT)
 
 
 def results_command(a: argparse.Namespace) -> int:
-    if a.output is not None and not a.output.name.endswith(KINDS):
-        raise InputError(f"{a.output}: expected a name that ends in {', '.join(KINDS)}")
-    writable(a.output)
-    since_us = None if a.since is None else _moment("--since", a.since)
-    until_us = None if a.until is None else _moment("--until", a.until, days=1)
-    if since_us is not None and until_us is not None and since_us >= until_us:
-        raise InputError(f"--since: expected a time before --until {a.until}, not '{a.since}'")
+    require_kind(a.output)
+    since_us, until_us = period_us(a.since, a.until)
     if a.database is not None and not a.rebuild:
         raise InputError("--database: give --rebuild with it")
     if a.rebuild:
         _rebuild(a.folder, a.database)
     runs = _runs(a.folder, since_us=since_us, until_us=until_us, serial=a.serial, code=a.code)
     if a.output is not None:
-        _write(a.output, runs)
+        write_table(a.output, {c.name: _TYPES[c.kind] for c in COLUMNS}, _joined(runs))
     if a.json:
         _emit(str(a.folder), runs)
     elif a.output is None and runs.rows:
@@ -66,6 +61,15 @@ def results_command(a: argparse.Namespace) -> int:
         more = f" and {len(runs.skipped) - NAMED_MOST} more" if len(runs.skipped) > NAMED_MOST else ""
         say(f"{a.folder}: left out, not readable as an outcome: {', '.join(runs.skipped[:NAMED_MOST])}{more}")
     return 0
+
+
+def period_us(since: str | None, until: str | None) -> tuple[int | None, int | None]:
+    """The first moment of ``since``, and the one after ``until``. Raises InputError."""
+    since_us = None if since is None else _moment("--since", since)
+    until_us = None if until is None else _moment("--until", until, days=1)
+    if since_us is not None and until_us is not None and since_us >= until_us:
+        raise InputError(f"--since: expected a time before --until {until}, not '{since}'")
+    return since_us, until_us
 
 
 def _moment(option: str, text: str, days: int = 0) -> int:
@@ -197,22 +201,30 @@ def _put(text: str) -> None:
     sys.stdout.write(text)
 
 
-def _write(path: Path, runs: Runs) -> None:
-    """Raises InputError."""
+def require_kind(path: Path | None) -> None:
+    """Raises InputError where no table has such a name, or none can be written
+    there."""
+    if path is not None and not path.name.endswith(KINDS):
+        raise InputError(f"{path}: expected a name that ends in {', '.join(KINDS)}")
+    writable(path)
+
+
+def write_table(path: Path, types: Mapping[str, type], rows: Iterable[Sequence[Any]]) -> None:
+    """Cells of these types by column, None for a gap. Raises InputError."""
     try:
         with new_beside(path) as beside:
             if path.name.endswith(".parquet"):
                 from triaxcald.tables.arrow import write_rows
 
-                write_rows(beside, {c.name: _TYPES[c.kind] for c in COLUMNS}, _joined(runs))
+                write_rows(beside, types, rows)
                 return
             with beside.open("wb") as file:
                 packed = path.name.endswith(".gz")
                 bytes_ = gzip.GzipFile(filename="", fileobj=file, mode="wb", mtime=0) if packed else file
                 with io.TextIOWrapper(bytes_, "utf-8", newline="") as out:
                     lines = csv.writer(out, lineterminator="\n")
-                    lines.writerow(NAMES)
-                    lines.writerows(_joined(runs))
+                    lines.writerow(types)
+                    lines.writerows(rows)
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from e
 

@@ -5,7 +5,7 @@ missing, damaged or behind them.
 """
 
 from triaxcald.store.database import FILE_NAME, TIMES, VERSION
-from triaxcald.store.index import History, Runs, Store
+from triaxcald.store.index import History, Runs, Store, timed_in
 from triaxcald.store.rows import BESIDE, microseconds
 
-__all__ = ["BESIDE", "FILE_NAME", "TIMES", "VERSION", "History", "Runs", "Store", "microseconds"]
+__all__ = ["BESIDE", "FILE_NAME", "TIMES", "VERSION", "History", "Runs", "Store", "microseconds", "timed_in"]

@@ -11,7 +11,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.outcome import SUFFIX
 from triaxcald.schema.codes import Verdict
 from triaxcald.schema.columns import COLUMNS, NAMES, Kind
-from triaxcald.store.database import OWN, TIMES, Database, check, has_service, transaction
+from triaxcald.store.database import BUSY_S, OWN, TIMES, Database, check, has_service, transaction
 from triaxcald.store.rows import BESIDE, Cell, NoOutcome, cells_of
 
 BATCH = 500
@@ -142,6 +142,20 @@ class Store:
         with self._lock:
             if not self._database.exists and not self._listing():
                 return Runs([], [])  # no index in a folder without an outcome
+            return self._database.on(work)
+
+    def timed(self, *, since_us: int | None = None, until_us: int | None = None) -> Runs:
+        """As `runs`; the rows have the cells of `TIMES` too, and files are named
+        whether they are in the folder or not."""
+
+        def work(db: sqlite3.Connection) -> Runs:
+            self._refresh(db)
+            left_out = db.execute("SELECT name FROM file WHERE name NOT IN (SELECT outcome FROM run)")
+            return Runs(_timed(db, since_us, until_us), sorted([*(str(name) for (name,) in left_out), *self._unread]))
+
+        with self._lock:
+            if not self._database.exists and not self._listing():
+                return Runs([], [])
             return self._database.on(work)
 
     def digests(self) -> dict[str, str]:
@@ -288,6 +302,23 @@ class Store:
             return None
         row = [cells[column] for column in (*NAMES, *TIMES)]
         return (*row, _check(row))
+
+
+def timed_in(path: Path, *, since_us: int | None = None, until_us: int | None = None) -> list[Cells]:
+    """The rows of a file `triaxcal.sqlite` as it is, without a look at its folder, with
+    the cells of `NAMES` and `TIMES`. Raises sqlite3.Error for a file that is none, of
+    another version, or damaged."""
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=BUSY_S)) as db:
+        return _timed(db, since_us, until_us)
+
+
+def _timed(db: sqlite3.Connection, since_us: int | None, until_us: int | None) -> list[Cells]:
+    given = {"at_us >= ?": since_us, "at_us < ?": until_us}
+    wanted = {condition: value for condition, value in given.items() if value is not None}
+    where = f" WHERE {' AND '.join(wanted)}" if wanted else ""
+    columns = ", ".join(f'"{name}"' for name in (*NAMES, *OWN))
+    rows = db.execute(f"SELECT {columns} FROM run{where} ORDER BY at_us, outcome", tuple(wanted.values())).fetchall()
+    return [tuple(_checked(row)) for row in rows]
 
 
 def _checked(row: Cells) -> list[Cell]:

@@ -60,7 +60,7 @@ def test_every_command_has_a_function_that_runs_it_and_help_that_says_what_it_do
 
 def test_commands_that_compute_are_marked_where_they_are_declared() -> None:
     marked = {command.prog for command in leaves(parser()) if command.get_default("computes")}
-    names = ("poses", "fit", "diagnose", "rezero", "apply", "verify", "frame", "plan", "serve", "audit")
+    names = ("poses", "fit", "diagnose", "rezero", "apply", "verify", "frame", "plan", "serve", "audit", "fleet")
     many = ("poses", "fit", "diagnose", "verify", "apply")
     assert marked == {f"triaxcal {name}" for name in (*names, *(f"batch {name}" for name in many))}
 

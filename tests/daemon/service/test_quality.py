@@ -12,18 +12,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from triaxcal.population import PPK_LEAST, individuals, one_sided_interval, share_interval
 from triaxcald.schema.columns import NAMES
 from triaxcald.schema.quality import Chart, Quality
-from triaxcald.service.quality import (
-    COLUMNS,
-    PPK_LEAST,
-    UNITS,
-    chart_of,
-    individuals,
-    one_sided_interval,
-    quality_of,
-    share_interval,
-)
+from triaxcald.service.quality import COLUMNS, UNITS, chart_of, quality_of
 
 CODES = {"pass": "within_limits", "fail": "fit_outside", "aborted": "absent", "not_judged": "no_limit"}
 

@@ -1,0 +1,269 @@
+"""Fleets of known truth: what is read, what the document says, the table, and the command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.daemon.fleet.worlds import certificate, line, outcome, write
+from triaxcald.cli.commands import main
+from triaxcald.documents import to_text
+from triaxcald.errors import InputError
+from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
+from triaxcald.fleet.reading import certified_in
+from triaxcald.schema.fleet import FleetDocument
+
+FIGURES = {"scale_factor": np.ones(3), "misalignment": np.zeros(3), "bias": np.zeros(3)}
+
+
+def document_of(folder: Path, asked: Asked = Asked(), **selected: Any) -> dict[str, Any]:  # noqa: B008
+    runs = read_runs(str(folder), Selection(**selected))
+    made = fleet_document(fleets_of(runs), str(folder), runs.skipped, asked)
+    return FleetDocument.model_validate(json.loads(json.dumps(made))).document()
+
+
+@pytest.fixture(scope="module")
+def lined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    documents = line()
+    chances = [0.9 if d["work"]["batch"] == "B2" else 0.02 for d in documents]
+    return write(tmp_path_factory.mktemp("line"), documents, [certificate(p) for p in chances])
+
+
+@pytest.fixture(scope="module")
+def product(lined: Path) -> dict[str, Any]:
+    (of,) = document_of(lined, Asked(limit_g=0.02))["products"]
+    return of
+
+
+def figure(product: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(f for f in product["figures"] if f["name"] == name)
+
+
+# Reading.
+
+
+def test_units_and_runs_are_counted(product: dict[str, Any]) -> None:
+    assert (product["part_number"], product["units"], product["runs"], product["repeated"]) == ("TX-1", 60, 80, 10)
+    assert product["factors"] == {"batch": 2, "station": 2, "fixture": 3, "slot": 2, "time": 12}
+    assert product["certificates"] == 80
+
+
+def test_the_file_of_the_index_gives_the_same(lined: Path, product: dict[str, Any], tmp_path: Path) -> None:
+    (of,) = document_of(lined / "triaxcal.sqlite", Asked(limit_g=0.02))["products"]
+    assert of == product
+    alone = shutil.copy(lined / "triaxcal.sqlite", tmp_path / "copy.sqlite")
+    (without,) = document_of(Path(f"sqlite:///{alone}"), Asked(limit_g=0.02))["products"]
+    assert without["certificates"] == 0
+    assert figure(without, "bias_x") == figure(product, "bias_x")
+
+
+def test_what_is_no_folder_and_no_database_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.sqlite").write_bytes(b"SQLite format 3\0" + bytes(100))
+    for name in ("missing", "x.sqlite"):
+        with pytest.raises(InputError, match=name):
+            read_runs(str(tmp_path / name), Selection())
+    with sqlite3.connect(tmp_path / "other.sqlite") as db:
+        db.execute("CREATE TABLE run (a)")
+    with pytest.raises(InputError, match="no table of runs"):
+        read_runs(str(tmp_path / "other.sqlite"), Selection())
+
+
+def test_runs_are_chosen_by_time_and_place(lined: Path) -> None:
+    runs = read_runs(str(lined), Selection())
+    middle = runs.rows[40]["at_us"]
+    assert len(read_runs(str(lined), Selection(until_us=middle)).rows) == 40
+    assert len(read_runs(str(lined), Selection(since_us=middle)).rows) == 40
+    (of,) = document_of(lined, equal={"fixture": "F2"})["products"]
+    assert "fixture" not in of["factors"]
+    assert of["runs"] == sum(row["fixture"] == "F2" for row in runs.rows)
+    assert document_of(lined, equal={"serial": "5003"})["runs"] == 3
+
+
+def test_runs_that_measured_nothing_and_copies_do_not_count(tmp_path: Path) -> None:
+    one = outcome("1", 0, FIGURES)
+    aborted = outcome("2", 1, FIGURES) | {"verdict": "aborted", "code": "no_poses", "measured": None}
+    provisioned = outcome("3", 2, FIGURES) | {"work": None, "contents": None}
+    write(tmp_path, [one, one, aborted, provisioned])
+    (tmp_path / "z.outcome.json").write_text("{}")
+    found = document_of(tmp_path)
+    assert (found["units"], found["runs"]) == (1, 1)
+    assert found["skipped"] == ["z.outcome.json"]
+
+
+def test_part_numbers_are_taken_apart_and_the_largest_comes_first(tmp_path: Path) -> None:
+    parts = ["A", "B", "B", None]
+    write(tmp_path, [outcome("1", day, FIGURES, part_number=part) for day, part in enumerate(parts)])
+    assert [(p["part_number"], p["runs"]) for p in document_of(tmp_path)["products"]] == [("B", 2), (None, 1), ("A", 1)]
+
+
+def test_a_certificate_is_cut_out_as_it_would_be_parsed() -> None:
+    of = certificate(0.25)
+    for text in (to_text(of), json.dumps(of), json.dumps(of, indent=4)):
+        found = certified_in(text)
+        assert found.effects["temperature_bias"].probability == 0.25
+        assert found.effects["temperature_bias"].coefficients == {"x": (2.5e-6, 1e-6, "g/K")}
+        assert found.effects["hysteresis"].probability is None
+        assert set(found.effects) == {"temperature_bias", "hysteresis"}
+        assert found.uncertainty == {"this_fit": 2.6e-5, "another_day": 4e-3}
+    with pytest.raises(ValueError, match="no certificate"):
+        certified_in("{}")
+
+
+def test_a_damaged_certificate_is_named(tmp_path: Path) -> None:
+    write(tmp_path, [outcome("1", 0, FIGURES), outcome("2", 1, FIGURES)], [certificate(0.5)] * 2)
+    broken = sorted(tmp_path.glob("*.certificate.json"))[0]
+    broken.write_text("{")
+    assert document_of(tmp_path)["skipped"] == [broken.name]
+
+
+# What the document says.
+
+
+def test_the_fixture_that_shifts_a_bias_is_named_by_its_p_value(product: dict[str, Any]) -> None:
+    by = {c["factor"]: c for c in figure(product, "bias_y")["comparisons"]}
+    assert by["fixture"]["location_p"] < 1e-3
+    assert all(of["location_p"] is None or of["location_p"] > 0.05 for name, of in by.items() if name != "fixture")
+    far = max(by["fixture"]["groups"], key=lambda g: abs(g["apart"]))
+    assert far["name"] == "F2"
+    assert figure(product, "bias_x")["comparisons"][2]["location_p"] > 0.05
+
+
+def test_a_gauge_study_by_fixture_finds_its_size(product: dict[str, Any]) -> None:
+    by = {study["factor"]: study for study in figure(product, "bias_y")["gauge"]}
+    assert set(by) == {None, "fixture"}
+    of = by["fixture"]
+    assert (of["method"], of["parts"], of["appraisers"], of["measurements"]) == ("reml", 10, 3, 30)
+    # A shift of one in three fixtures: 8 mg · √(1/3).
+    assert of["components"]["reproducibility"]["sd"] == pytest.approx(8e-3 / np.sqrt(3), rel=0.1)
+    assert of["components"]["repeatability"]["sd"] == pytest.approx(3e-5, rel=0.4)
+    assert figure(product, "bias_x")["gauge"][0]["grr"] < 0.03
+
+
+def test_charts_state_their_run_lengths(product: dict[str, Any]) -> None:
+    charts = figure(product, "bias_x")["charts"]
+    assert charts["individuals"]["run_length"] == pytest.approx(152.7, abs=0.1)
+    assert charts["ewma"]["run_length"] == pytest.approx(499.7, abs=0.2)
+    assert charts["cusum"]["run_length"] == pytest.approx(465.4, abs=0.2)
+    assert charts["cusum"]["expected"] == pytest.approx(60 / 465.4, rel=0.01)
+
+
+def test_capability_is_that_of_the_service(lined: Path, product: dict[str, Any]) -> None:
+    from triaxcald.service.quality import quality_of
+
+    rows = read_runs(str(lined), Selection()).rows
+    theirs = next(c for c in quality_of(rows)["characteristics"] if c["name"] == "rms_g")
+    ours = figure(product, "rms_g")["capability"]
+    assert ours["ppk"] == theirs["ppk"]
+    assert ours["ppk_interval"] == theirs["ppk_interval"]
+    assert figure(product, "bias_x")["capability"] is None
+
+
+def test_effects_are_counted_by_their_probability(product: dict[str, Any]) -> None:
+    of = {effect["effect"]: effect for effect in product["effects"]}
+    assert of["temperature_bias"]["units"] == 60
+    assert of["temperature_bias"]["expected"] == pytest.approx(30 * 0.9 + 30 * 0.02, rel=1e-3)
+    assert of["temperature_bias"]["likely"] == 30
+    batch = next(c for c in of["temperature_bias"]["comparisons"] if c["factor"] == "batch")
+    assert batch["location_p"] < 1e-6
+    assert of["hysteresis"]["likely"] == 60  # a finding whose probability is not calibrated
+    assert figure(product, "temperature_bias.x")["n"] == 60
+
+
+def test_an_empty_world_shows_no_difference(tmp_path: Path) -> None:
+    shown = 0
+    for seed in range(5):
+        (of,) = document_of(write(tmp_path / str(seed), line(40, seed, repeated=0, shift=0.0)))["products"]
+        ps = [c[key] for f in of["figures"] for c in f["comparisons"] for key in ("location_p", "scatter_p")]
+        shown += min(p for p in ps if p is not None) < 0.05
+    assert shown <= 1
+
+
+@pytest.mark.slow
+def test_a_walk_of_the_biases_gives_the_interval(tmp_path: Path) -> None:
+    """|a| moves by one bias in a direction: with 0.1 mg a √day the 2 mg are exceeded in 5 % after some 100 days."""
+    folder = write(tmp_path, line(40, 3, repeats=4, repeated=40, shift=0.0, walk=1e-4))
+    (of,) = document_of(folder, Asked(limit_g=2e-3))["products"]
+    drift = figure(of, "bias_x")["drift"]
+    assert drift["movement"] == "random_walk"
+    assert drift["rate_interval"][0] < 1e-4 < drift["rate_interval"][1]
+    expected = (2e-3 / 1.96 / 1e-4) ** 2
+    assert of["recalibration"]["days"] == pytest.approx(expected, rel=0.3)
+    low, high = of["recalibration"]["interval"]
+    assert low < expected < high
+
+
+def test_without_units_that_repeat_there_is_neither_study_nor_interval(tmp_path: Path) -> None:
+    (of,) = document_of(write(tmp_path, line(12, repeated=0)), Asked(limit_g=1.0))["products"]
+    assert of["recalibration"] is None
+    assert all(f["gauge"] == [] and f["drift"] is None for f in of["figures"])
+
+
+def test_units_without_a_serial_number_are_in_no_distribution(tmp_path: Path) -> None:
+    nameless = outcome("1", 0, FIGURES)
+    nameless["serial"] = nameless["work"]["serial"] = None
+    write(tmp_path, [nameless, outcome("2", 1, FIGURES)])
+    (of,) = document_of(tmp_path)["products"]
+    assert (of["units"], of["runs"]) == (1, 2)
+    assert figure(of, "bias_x")["n"] == 1
+
+
+# The table, and the command.
+
+
+def test_the_table_has_a_row_for_each_unit_and_figure(lined: Path) -> None:
+    fleets = fleets_of(read_runs(str(lined), Selection()))
+    rows = [dict(zip(COLUMNS, row, strict=True)) for row in table_rows(fleets)]
+    assert len(rows) == 60 * len(fleets[0].figures)
+    of = {(row["serial"], row["figure"]): row for row in rows}
+    assert of["5000", "bias_y"]["runs"] == 3
+    assert of["5000", "bias_y"]["standard_error"] == pytest.approx(3e-5)
+    assert of["5000", "rms_g"]["standard_error"] is None
+    deviations = [row["deviation"] for row in rows if row["figure"] == "bias_x"]
+    assert np.median(deviations) == pytest.approx(0.0, abs=0.02)
+
+
+def test_the_command_prints_the_document_and_writes_the_table(
+    lined: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "fleet.parquet"
+    code = main(["fleet", str(lined), "--fixture", "F2", "--table", str(table), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert (code, told["format"], told["selected"]) == (0, "triaxcal.fleet/1", {"--fixture": "F2"})
+    import pyarrow.parquet as pq
+
+    assert pq.read_table(table).num_rows == sum(f["n"] for f in told["products"][0]["figures"])
+
+
+def test_the_command_tells_what_stands_out(lined: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "fleet.csv"
+    assert main(["fleet", str(lined), "--limit", "0.02", "--table", str(table)]) == 0
+    told = capsys.readouterr().out
+    assert "60 units in 80 runs, 10 measured more than once" in told
+    assert "Bias y differs by fixture, most at F2" in told
+    with table.open(newline="", encoding="utf-8") as file:
+        assert next(csv.reader(file)) == [*COLUMNS]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["--probability", "1"],
+        ["--table", "x.txt"],
+        ["--since", "then"],
+        ["--since", "2026-02-01", "--until", "2026-01-01"],
+    ],
+)
+def test_wrong_options_are_refused(lined: Path, wrong: list[str]) -> None:
+    assert main(["fleet", str(lined), *wrong]) == 2
+
+
+def test_an_empty_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fleet", str(tmp_path)]) == 2
+    assert "no run has measured anything" in capsys.readouterr().err

@@ -1,0 +1,119 @@
+"""The page of a fleet: whole, quoted, and of the width of a phone."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.fleet.worlds import certificate, line, write
+from triaxcald.fleet import Asked, Selection, fleet_document, fleets_of, read_runs, render_fleet
+from triaxcald.fleet.page import drift_table, gauge_table, lasting, notices
+from triaxcald.schema.fleet import FleetDocument
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class Placed:
+    kind: str
+    place: str
+    since: str | None
+    figure: str
+    probability: float
+    size: str
+    text: str
+
+
+PLACED = [
+    Placed("hour", "14-18", None, "bias_x", 0.6, "0.1 mg", "The bias of x is higher in the afternoon."),
+    Placed("fixture", "F2 <b>", "2026-03-02", "bias_y", 0.998, "4.0(2) mg", "Fixture F2 shifts the bias of y."),
+]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+    documents = line()
+    for document in documents[:3]:
+        document["work"]["batch"] = '<script>alert("x")</script>'
+    folder = write(tmp_path_factory.mktemp("line"), documents, [certificate(0.9)] * len(documents))
+    runs = read_runs(str(folder), Selection())
+    fleets = fleets_of(runs)
+    made = fleet_document(fleets, "<out>", runs.skipped, Asked(limit_g=0.02), lambda _: PLACED)
+    document = FleetDocument.model_validate(made).document()
+    return document, render_fleet(document, fleets)
+
+
+def test_the_page_is_whole_and_quotes_what_data_say(page: tuple[dict, str]) -> None:
+    class Tags(HTMLParser):
+        found: list[str]
+
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            self.found.append(tag)
+            assert not any(
+                name in ("src", "onload") or (name == "href" and not (of or "").startswith("#")) for name, of in attrs
+            )
+
+    parser = Tags()
+    parser.found = []
+    parser.feed(page[1])
+    assert "script" not in parser.found
+    assert "b" not in parser.found
+    assert parser.found.count("svg") >= 20
+    assert "&lt;out&gt;" in page[1]
+    for heading in (
+        "Effects of places", "Distributions", "Control charts", "Capability", "Gauge repeatability and reproducibility",
+        "Recalibration interval", "Effects",
+    ):  # fmt: skip
+        assert f"<h3>{heading}</h3>" in page[1]
+
+
+def test_effects_of_places_come_with_the_most_probable_first(page: tuple[dict, str]) -> None:
+    (product,) = page[0]["products"]
+    assert [value["kind"] for value in product["places"]] == ["fixture", "hour"]
+    assert page[1].index("Fixture F2 shifts the bias of y.") < page[1].index("The bias of x is higher")
+
+
+def test_the_same_fleet_gives_the_same_bytes(page: tuple[dict, str]) -> None:
+    document, text = page
+    again = FleetDocument.model_validate(document).document()
+    assert again == document
+    assert text.count("<figure>") == text.count("</figure>")
+
+
+def test_notices_name_the_fixture_and_the_gauge(page: tuple[dict, str]) -> None:
+    told = list(notices(page[0]["products"][0]))
+    assert any("Bias y differs by fixture, most at F2" in text for text in told)
+    assert any("Bias y: the measurement makes" in text and "fixture" in text for text in told)
+
+
+def test_tables_have_a_row_a_coefficient(page: tuple[dict, str]) -> None:
+    (product,) = page[0]["products"]
+    assert len(drift_table(product)) == 9
+    gauges = gauge_table(product)
+    assert gauges["factors"] == ["fixture"]
+    assert {"Bias y, 10⁻³ g"} <= {row["title"] for row in gauges["rows"]}
+
+
+def test_times_are_told_in_their_unit() -> None:
+    assert [lasting(days) for days in (0.0, 0.01, 0.5, 3.0, 100.0, 1000.0, None)] == [
+        "no time", "14 minutes", "12 hours", "3.0 days", "3.3 months", "2.7 years", "longer than the data can tell",
+    ]  # fmt: skip
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium (apt-get install chromium)")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_a_phone(page: tuple[dict, str], tmp_path: Path, scheme: str) -> None:
+    from playwright.sync_api import sync_playwright
+
+    (tmp_path / "fleet.html").write_text(page[1], encoding="utf-8")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        shown = browser.new_page(viewport={"width": 400, "height": 800}, color_scheme=scheme)
+        shown.goto((tmp_path / "fleet.html").as_uri())
+        assert shown.evaluate("document.documentElement.scrollWidth") == 400
+        browser.close()

@@ -1,0 +1,156 @@
+"""What only many units show: distributions, control charts, capability, gauge studies
+and drift, from figures of units to values. No I/O, no clock."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from triaxcal.lazy import lazily
+
+if TYPE_CHECKING:
+    from triaxcal.population.capability import (
+        LEVEL,
+        PPK_LEAST,
+        Capability,
+        capability_of,
+        one_sided_interval,
+        ppk_of,
+        share_interval,
+        two_sided_interval,
+    )
+    from triaxcal.population.control_charts import (
+        Cusum,
+        Ewma,
+        Individuals,
+        cusum,
+        cusum_run_length,
+        ewma,
+        ewma_run_length,
+        individuals,
+        individuals_run_length,
+        mean_of,
+        one_sided_run_length,
+    )
+    from triaxcal.population.distributions import (
+        QUANTILES,
+        Distribution,
+        Heterogeneity,
+        distribution,
+        heterogeneity,
+        holm,
+        normality_p,
+    )
+    from triaxcal.population.drift import (
+        Drift,
+        Movement,
+        Moving,
+        Part,
+        RecalibrationInterval,
+        change_after,
+        drift_of,
+        recalibration_interval,
+    )
+    from triaxcal.population.gauge import (
+        Component,
+        GaugeStudy,
+        Method,
+        Source,
+        gauge_study,
+    )
+
+_NAMES = {
+    "capability": (
+        "LEVEL",
+        "PPK_LEAST",
+        "Capability",
+        "capability_of",
+        "one_sided_interval",
+        "ppk_of",
+        "share_interval",
+        "two_sided_interval",
+    ),
+    "control_charts": (
+        "Cusum",
+        "Ewma",
+        "Individuals",
+        "cusum",
+        "cusum_run_length",
+        "ewma",
+        "ewma_run_length",
+        "individuals",
+        "individuals_run_length",
+        "mean_of",
+        "one_sided_run_length",
+    ),
+    "distributions": (
+        "QUANTILES",
+        "Distribution",
+        "Heterogeneity",
+        "distribution",
+        "heterogeneity",
+        "holm",
+        "normality_p",
+    ),
+    "drift": (
+        "Drift",
+        "Movement",
+        "Moving",
+        "Part",
+        "RecalibrationInterval",
+        "change_after",
+        "drift_of",
+        "recalibration_interval",
+    ),
+    "gauge": (
+        "Component",
+        "GaugeStudy",
+        "Method",
+        "Source",
+        "gauge_study",
+    ),
+}
+
+__all__ = [
+    "LEVEL",
+    "PPK_LEAST",
+    "QUANTILES",
+    "Capability",
+    "Component",
+    "Cusum",
+    "Distribution",
+    "Drift",
+    "Ewma",
+    "GaugeStudy",
+    "Heterogeneity",
+    "Individuals",
+    "Method",
+    "Movement",
+    "Moving",
+    "Part",
+    "RecalibrationInterval",
+    "Source",
+    "capability_of",
+    "change_after",
+    "cusum",
+    "cusum_run_length",
+    "distribution",
+    "drift_of",
+    "ewma",
+    "ewma_run_length",
+    "gauge_study",
+    "heterogeneity",
+    "holm",
+    "individuals",
+    "individuals_run_length",
+    "mean_of",
+    "normality_p",
+    "one_sided_interval",
+    "one_sided_run_length",
+    "ppk_of",
+    "recalibration_interval",
+    "share_interval",
+    "two_sided_interval",
+]
+
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
+    __getattr__ = lazily(__name__, _NAMES)
