@@ -1,4 +1,4 @@
-"""The commands at many recordings, with their arguments and help."""
+"""The commands at many recordings and outcomes, with their arguments and help."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ WHICH = "REC|FOLDER|GLOB|MANIFEST|URL"
 def register_many(commands: Any) -> None:
     _audit(commands)
     _batch(commands)
+    _fleet(commands)
 
 
 def add_many(p: Any, table: bool = False) -> None:
@@ -137,3 +138,45 @@ def _add_calibration(p: Any) -> None:
         help="a calibration, loop or certificate document; beside: of each recording NAME.cal.json, else "
         "NAME.calibration.json or NAME.certificate.json",
     )  # fmt: skip
+
+
+def _fleet(commands: Any) -> None:
+    p = add_command(
+        commands, "fleet", "fleet:fleet_command", "what only many units show: scatter, drift, charts, gauge studies",
+        "Reads the outcomes of a folder, or a service's database, and the certificates beside them.",
+        "fleet out --report fleet.html --table fleet.csv",
+        computes=True,
+    )  # fmt: skip
+    p.add_argument(
+        "source", metavar="FOLDER|DATABASE",
+        help="folder of outcomes, triaxcal.sqlite, or postgresql://USER@HOST/NAME with the runs of all its stations",
+    )  # fmt: skip
+    p.add_argument("--since", metavar="TIME", help="runs that began at or after this date or time, as for results")
+    p.add_argument("--until", metavar="TIME", help="runs that began before this time, or on or before this date")
+    for name, what in (
+        ("part-number", "part number"), ("batch", "batch"), ("station", "station"), ("fixture", "fixture"),
+        ("slot", "slot"), ("operator", "operator"), ("order", "work order"), ("serial", "serial number"),
+    ):  # fmt: skip
+        p.add_argument(f"--{name}", metavar="TEXT", help=f"runs of this {what} alone")
+    p.add_argument(
+        "--limit", type=positive, metavar="G",
+        help="of the error of |a| at the end of a recalibration interval; default: that of the latest run",
+    )  # fmt: skip
+    p.add_argument(
+        "--probability", type=_share, default=0.05, metavar="P",
+        help="that the error is beyond the limit then; default 0.05",
+    )  # fmt: skip
+    p.add_argument("--report", type=Path, metavar="PAGE.html", help="the page, in one file")
+    p.add_argument("--table", type=Path, metavar="TABLE", help="a row a unit and figure: .csv, .csv.gz or .parquet")
+    add_json(p)
+
+
+def _share(text: str) -> float:
+    """Between 0 and 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, not '{text}'")
+    return value
