@@ -130,8 +130,8 @@ GAPS = 1 / 3
 """Missing share of a pose above which the slow noise absorbed by its mean is computed
 (`_taken_by_the_mean`). Bumps leave smaller gaps; after a long disturbance 1/f noise
 would come out at a third of its size."""
-PART = 2**22
-"""Numbers held at once in each of the few arrays of a long pose: 32 MiB."""
+PART = 2**20
+"""Numbers held at once in each of the few arrays of a long pose: 8 MiB."""
 MISFIT = 1e-3
 """Probability of the fit below which the model is fitted to lower frequencies
 only."""

@@ -24,7 +24,7 @@ from triaxcal.poses.quality.finding import (
     StillIntervals,
     StuckOutput,
 )
-from triaxcal.poses.stillness.windows import noise_of
+from triaxcal.poses.stillness.windows import PARTS_MOST, noise_of
 
 # Extremes of every tenth of a second with their counts, and the step of the output.
 
@@ -98,6 +98,7 @@ class CellKeeper:
 
     size: int
     _done: list[tuple[Any, ...]] = field(default_factory=list)  # as Cells has them, behind its size
+    _whole: int = 0  # of which so many are `PARTS_MOST` joined
 
     def feed(self, time_ns: Ints, u: Floats) -> None:
         """``u`` (3,n), n a multiple of ``size``."""
@@ -107,7 +108,10 @@ class CellKeeper:
         small = np.min_scalar_type(self.size)  # there is one for each tenth of a second, however long
         at_high = np.count_nonzero(blocks == high[:, :, None], axis=2).astype(small)
         at_low = np.count_nonzero(blocks == low[:, :, None], axis=2).astype(small)
-        self._done.append((times[:, 0].copy(), times[:, -1].copy(), high.T, low.T, at_high.T, at_low.T))
+        self._done.append((times[:, 0].copy(), times[:, -1].copy(), _short(high.T), _short(low.T), at_high.T, at_low.T))
+        if len(self._done) - self._whole >= PARTS_MOST:
+            self._done[self._whole :] = [joined(self._done[self._whole :])]
+            self._whole += 1
 
     def cells(self) -> Cells:
         if not self._done:
@@ -115,8 +119,14 @@ class CellKeeper:
             empty = np.zeros((0, 3))
             return Cells(self.size, none, none, empty, empty, empty.astype(np.int64), empty.astype(np.int64))
         if len(self._done) > 1:
-            self._done = [joined(self._done)]
+            self._done, self._whole = [joined(self._done)], 1
         return Cells(self.size, *self._done[0])
+
+
+def _short(values: Floats) -> Floats:
+    """With half the digits, where these are all: readings of up to 24 bits."""
+    short = values.astype(np.float32)
+    return short if (short == values).all() else values
 
 
 @dataclass
@@ -468,8 +478,8 @@ def _side(cells: Cells, axis: int, side: int) -> tuple[Floats, Floats]:
     """Extremes of one side, with the sign that makes them maxima, and their
     counts."""
     if side > 0:
-        return cells.high[:, axis], cells.at_high[:, axis].astype(float)
-    return -cells.low[:, axis], cells.at_low[:, axis].astype(float)
+        return cells.high[:, axis].astype(float), cells.at_high[:, axis].astype(float)
+    return -cells.low[:, axis].astype(float), cells.at_low[:, axis].astype(float)
 
 
 def _piled(value: Floats, count: Floats, place: Ints, rail: float) -> list[int]:

@@ -173,27 +173,28 @@ class Spectra:
         tests = 3 * sum(int(b.inside.sum()) for b in self.bands)
         found: list[Line] = []
         for band in self.bands:
-            first = int(np.searchsorted(self._kept, band.bins[0]))
-            power = np.array([self._power[i][:, first : first + len(band.bins)] for i in chosen], dtype=float)
-            line = self._judged(band, power, FALSE_ALARM / tests)
+            line = self._judged(band, chosen, FALSE_ALARM / tests)
             if line is not None and not any(abs(line.frequency_hz - f.frequency_hz) < 1.0 for f in found):
                 found.append(line)
         return found
 
-    def _judged(self, band: Band, power: Floats, alarm: float) -> Line | None:
-        """The line of a band from the ``power`` (m,3,b) of m segments, or None."""
+    def _judged(self, band: Band, chosen: Ints, alarm: float) -> Line | None:
+        """The line of a band from the power of the ``chosen`` segments (m,), or None."""
         amplitude, places, least = np.zeros(3), np.zeros(3), 1.0
         bin_hz = 1e9 / self.period_ns / self.size
+        first = int(np.searchsorted(self._kept, band.bins[0]))
+        bins = slice(first, first + len(band.bins))
         for axis in range(3):
+            power = np.array([self._power[i][axis, bins] for i in chosen], dtype=float)
             # Segments with a usual level; ratio of their mean spectrum to that level.
-            level = np.median(power[:, axis, band.flank], axis=1)
-            sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < STRONG * np.median(level))
+            level = np.median(power[:, band.flank], axis=1)
+            sound = (level > 1e-12 * power.max(initial=0.0)) & (level < STRONG * np.median(level))
             if sound.sum() < SEGMENTS_LEAST:
                 continue
             # One level for all: a bin over its own segment's level is small
             # where that is drawn from it.
             usual = float(np.mean(level[sound]))
-            ratios = power[sound, axis] / usual
+            ratios = power[sound] / usual
             ratio, clipped = ratios.mean(axis=0), np.minimum(ratios, KNOCK).mean(axis=0)
             # Test of the highest bin, interpolation of its frequency, amplitude from
             # its excess.

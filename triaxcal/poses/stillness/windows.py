@@ -27,6 +27,11 @@ WINDOW_LEAST = 3
 """Samples in a window at low rates: fewer do not determine a scatter."""
 
 
+PARTS_MOST = 256
+"""Small arrays that are kept until they are joined: they lie among those that are given
+up, and would keep their memory from being used again."""
+
+
 def window_size(period_ns: float) -> int:
     """Samples in a window."""
     return max(WINDOW_LEAST, round(WINDOW_S * 1e9 / period_ns))
@@ -85,7 +90,12 @@ class WindowCutter:
     _period_ns: float = 0.0
     _names: tuple[str, ...] = ()
     _done: list[tuple[Any, ...]] = field(default_factory=list)
-    """As `Windows` has them, the channels last."""
+    """As `Windows` has them, without the hops, the channels last."""
+    _whole: int = 0
+    """How many of these are `PARTS_MOST` joined."""
+    _hops: list[tuple[Any, ...]] = field(default_factory=list)
+    """Windows with a hop, by number, and their hops."""
+    _count: int = 0
     _last_ns: int | None = None
     _broken: bool = False
 
@@ -161,17 +171,29 @@ class WindowCutter:
         self._broken = False
         self._names = tuple(channels)
         means = [v.reshape(count, self._size).mean(axis=1) for v in channels.values()]
-        self._done.append(
-            (times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, _hop(columns), in_one_piece, *means)
-        )
+        # A hop is mostly zero: it is kept where it is not.
+        hop = _hop(columns)
+        at = np.flatnonzero(hop.any(axis=1))
+        if len(at):
+            self._hops.append((self._count + at, hop[at]))
+        self._count += count
+        self._done.append((times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, in_one_piece, *means))
+        if len(self._done) - self._whole >= PARTS_MOST:
+            self._done[self._whole :] = [joined(self._done[self._whole :])]
+            self._whole += 1
 
     def windows(self) -> Windows:
         """Raises InvalidData where there is not one whole window yet."""
         if not self._done:
             raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
         if len(self._done) > 1:
-            self._done = [joined(self._done)]
-        start, end, mean, variance, cross, hop, in_one_piece, *channels = self._done[0]
+            self._done, self._whole = [joined(self._done)], 1
+        if len(self._hops) > 1:
+            self._hops = [joined(self._hops)]
+        start, end, mean, variance, cross, in_one_piece, *channels = self._done[0]
+        hop = np.zeros_like(mean)  # of which no memory is taken where nothing is written
+        for at, values in self._hops:
+            hop[at] = values
         named = dict(zip(self._names, channels, strict=True))
         return Windows(self._size, start, end, mean, variance, cross, hop, named, in_one_piece)
 
