@@ -79,7 +79,11 @@ def separate_workers(count: int) -> Iterator[Cluster]:
     """A `dask scheduler` and so many `dask worker`s, as anybody starts them."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scheduler.json"
-        environment = {**os.environ, "DASK_LOGGING__DISTRIBUTED": "critical"}
+        environment = {
+            **os.environ,
+            "DASK_LOGGING__DISTRIBUTED": "critical",
+            "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",
+        }
         dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
         started = [subprocess.Popen([*dask, "--no-dashboard", "--scheduler-file", str(file)], env=environment)]
         try:
