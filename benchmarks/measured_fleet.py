@@ -2,8 +2,8 @@
 
     python -m benchmarks.measured_fleet [--write]
 
-Runs 1 to 5 of eight sensors on one board, one after the other, in ../shared/datasets/mimu4444. Each run of each sensor is
-calibrated by the linear model. The coefficients are then those of a fleet: how they are distributed over sensors, a
+Runs 1 to 5 of eight sensors on one board, one after the other, in ../shared/datasets/mimu4444. Each run of each sensor
+is calibrated by the linear model. The coefficients are then those of a fleet: how they are distributed over sensors, a
 gauge study of sensors by runs, how they move from run to run, and how long a calibration lasts. The recordings have no
 date: time is counted in runs, and so is the interval. ``--write`` puts the section into docs/measured.md.
 """
