@@ -33,10 +33,14 @@ from triaxcal.interchange.calibration_reading import (
 from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
+    from triaxcal.interchange.odds_document import odds_document, odds_of
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
 
-_NAMES = {"pooled_documents": ("agreement_document", "with_recordings")}
-"""They import the diagnosis, which most commands do not need."""
+_NAMES = {
+    "odds_document": ("odds_document", "odds_of"),
+    "pooled_documents": ("agreement_document", "with_recordings"),
+}
+"""They import the posterior, which most commands do not need."""
 
 __all__ = [
     "WEIGHT",
@@ -58,6 +62,8 @@ __all__ = [
     "holds_of",
     "linear_errors_of",
     "logged_in",
+    "odds_document",
+    "odds_of",
     "poses_document",
     "reference_unit_in",
     "residual_document",

@@ -307,6 +307,12 @@ def _command(
     return p
 
 
+def add_odds(p: Any, more: str = "") -> None:
+    p.add_argument(
+        "--odds", metavar="FILE", help=f"odds of each effect, learned from units of the type (`fleet -o`){more}"
+    )
+
+
 def _line(commands: Any) -> None:
     p = _command(
         commands, "demo", "stations:demo_command", "the whole line on two simulated units, in about a minute",
@@ -332,6 +338,7 @@ def _line(commands: Any) -> None:
         "--rezero", action="append", metavar="CAL",
         help="renew the three biases of this calibration alone, by plan.rezero_poses poses; of several units once each",
     )  # fmt: skip
+    add_odds(p, "; in place of those that the station names")
     _add_work(p)
     add_force(p)
     add_json(p)
@@ -492,6 +499,7 @@ def _on_recordings(commands: Any) -> None:
         "--at", type=moment, metavar="end|mean|SECONDS",
         help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
     )  # fmt: skip
+    add_odds(p)
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p = _command(
         commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",

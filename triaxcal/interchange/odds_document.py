@@ -1,0 +1,52 @@
+"""Learned odds as a document (`triaxcal.odds/1`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from triaxcal.errors import InvalidData
+from triaxcal.interchange.calibration_document import Document
+from triaxcal.population.odds import LearnedEffect, LearnedOdds
+from triaxcal.rounding import uncertainty
+
+FORMAT = "triaxcal.odds/1"
+
+
+def odds_document(odds: LearnedOdds) -> Document:
+    from triaxcal import schema  # pydantic, which nothing else here needs
+
+    return schema.LearnedOdds(
+        format="triaxcal.odds/1",
+        part_number=odds.part_number,
+        units=odds.units,
+        effects={
+            name: schema.LearnedEffect.model_validate(
+                {"odds": uncertainty(learned.odds), "units": uncertainty(learned.units)}
+            )
+            for name, learned in odds.effects.items()
+        },
+        others=float(uncertainty(odds.others) or odds.others),
+        unmodelled_probability=float(uncertainty(odds.unmodelled_probability) or odds.unmodelled_probability),
+    ).document()
+
+
+def odds_of(document: Mapping[str, Any], *, where: str, part_number: str | None = None) -> LearnedOdds:
+    """Raises InvalidData, which begins with ``where``, for another document, and for
+    odds of another part number than the unit's."""
+    from triaxcal import schema
+
+    if document.get("format") != FORMAT:
+        raise InvalidData(f"{where}: expected a document of format {FORMAT}, not {document.get('format')!r}")
+    if fault := schema.LearnedOdds.fault_in(document):
+        raise InvalidData(f"{where}: {fault}")
+    found = schema.LearnedOdds.model_validate(document)
+    if part_number is not None and found.part_number is not None and part_number != found.part_number:
+        raise InvalidData(f"{where}: odds of part number {found.part_number}, and the unit has {part_number}")
+    return LearnedOdds(
+        found.part_number,
+        found.units,
+        {name: LearnedEffect(learned.odds, learned.units or 0.0) for name, learned in found.effects.items()},
+        found.others,
+        found.unmodelled_probability,
+    )
