@@ -450,7 +450,7 @@ def earlier_of(calibration: Calibration, name: str = "", *, sha256: str = "", re
 def learned_odds_in(odds: LearnedOdds | Mapping[str, Any] | str | os.PathLike[str]) -> LearnedOdds:
     """Learned odds, as they are, from their document, or from its file. Raises
     InvalidData, OSError."""
-    from triaxcal.interchange.odds_document import odds_of  # the posterior, which nothing else here needs
+    from triaxcal.interchange.population_documents import odds_of  # the posterior, which nothing else here needs
     from triaxcal.population.odds import LearnedOdds
 
     if isinstance(odds, LearnedOdds):

@@ -177,7 +177,8 @@ def _measure_recording(
     read = Measured(
         recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at, at_start,
         too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
-        odds=recording.attachments.get(ODDS_FILE), part_number=recording.metadata.get(WORK_RECORD, {}).get("part_number") or None,
+        odds=recording.attachments.get(ODDS_FILE),
+        part_number=recording.metadata.get(WORK_RECORD, {}).get("part_number") or None,
     )  # fmt: skip
 
     def parted(turn_s: float | None) -> Measured:

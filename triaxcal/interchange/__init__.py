@@ -33,12 +33,12 @@ from triaxcal.interchange.calibration_reading import (
 from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
-    from triaxcal.interchange.odds_document import odds_document, odds_of
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
+    from triaxcal.interchange.population_documents import odds_document, odds_of, seen_unit_in
 
 _NAMES = {
-    "odds_document": ("odds_document", "odds_of"),
     "pooled_documents": ("agreement_document", "with_recordings"),
+    "population_documents": ("odds_document", "odds_of", "seen_unit_in"),
 }
 """They import the posterior, which most commands do not need."""
 
@@ -67,6 +67,7 @@ __all__ = [
     "poses_document",
     "reference_unit_in",
     "residual_document",
+    "seen_unit_in",
     "sensor_of",
     "turning_document",
     "with_recordings",

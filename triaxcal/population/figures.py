@@ -2,8 +2,8 @@
 shifts, or scatters more.
 
 Figures that units have in common, as scale factors of one wafer, are correlated. So the
-nine coefficients are whitened together; a figure with a standard error of its own counts
-by it. Spreads come from differences of runs that follow each other in the same places:
+nine coefficients are whitened together; a figure with a standard error counts by it.
+Spreads come from differences of runs that follow each other in the same places:
 a shift of a place, or a slow drift, does not widen them.
 """
 
@@ -22,8 +22,10 @@ from triaxcal.distributions import chi2_ppf
 from triaxcal.model.directions import spiral
 from triaxcal.population.runs import COEFFICIENTS, SeenPoses, UnitRun
 
-LEAST_RUNS = 30
-"""Runs of a part number, and of a figure: fewer do not show how units differ."""
+LEAST_RUNS = 60
+"""Runs that have a figure: a spread of fewer is not known to a fifth."""
+LEAST_PAIRS = 30
+"""Pairs of runs that show the spread between units."""
 OCTAVES = 12
 """Bits of a converter that are looked at, from the one of the whole range down."""
 FINEST = 4.0
@@ -321,7 +323,7 @@ def _spread(values: Floats, pairs: Ints, mine: Bools, by_pairs: bool) -> Floats:
     difference."""
     differences = (values[pairs[:, 0]] - values[pairs[:, 1]]) / np.sqrt(2)
     own = values[mine]
-    some = np.isfinite(differences).sum(axis=0) >= LEAST_RUNS
+    some = np.isfinite(differences).sum(axis=0) >= LEAST_PAIRS
     from_pairs = 1.4826 * _median(np.abs(differences))
     found = np.where(some & by_pairs, from_pairs, 1.4826 * _median(np.abs(own - _median(own))))
     size = _median(np.abs(own))

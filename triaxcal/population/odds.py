@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.diagnosis import Loop
 from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.odds import EFFECT_ODDS
 from triaxcal.errors import InvalidData
@@ -37,6 +38,8 @@ UNMODELLED_LEAST = 0.05
 without one lower it to a quarter at most."""
 ROUNDS = 200
 """Of expectation and maximisation: more than it takes to settle to three digits."""
+EDGE = 1e-3
+"""By which a name among others stays below certain."""
 FLOOR = 1e-6
 """Smallest probability of a unit's posterior: documents are rounded."""
 
@@ -53,13 +56,12 @@ class LearnedEffect:
 @dataclass(frozen=True)
 class LearnedOdds:
     """Odds learned from a number of ``units`` of one ``part_number`` (None for any).
-    An effect that is not listed has odds of ``others``. ``unmodelled_probability`` is
-    that of a part that no name describes."""
+    An effect that is not listed has the odds of the catalogue.
+    ``unmodelled_probability`` is that of a part that no name describes."""
 
     part_number: str | None
     units: int
     effects: Mapping[str, LearnedEffect] = field(default_factory=dict)
-    others: float = CATALOGUE_ODDS
     unmodelled_probability: float = Odds().unmodelled_probability
 
     @property
@@ -79,6 +81,37 @@ class SeenUnit:
     effects: Mapping[str, SeenEffect]
     unmodelled: float | None = None
     unmodelled_prior: float = Odds().unmodelled_probability
+
+    @classmethod
+    def of(cls, loop: Loop) -> SeenUnit:
+        """What a diagnosis says. Beside an unmodelled part a name may be wrong, so then
+        it says nothing of names."""
+        evidence = loop.posterior.evidence
+        names = sorted({term.name for term in evidence.terms if term.effect is not None})
+        odds = {name: evidence.odds.of_effect(name, len(names)) for name in names}
+        unmodelled = loop.found.unexplained
+        stated = {name: loop.stated.get(name, 0.0) for name in names}
+        for finding in loop.findings:
+            stated[finding.effect] = finding.probability
+        groups = [(f.effect, f.alternatives) for f in loop.findings if f.alternatives]
+        effects = seen_effects(stated, groups, odds) if not unmodelled.significant else {}
+        return cls(effects, unmodelled.probability, evidence.odds.unmodelled_probability)
+
+
+def seen_effects(
+    stated: Mapping[str, float | None],
+    groups: Sequence[tuple[str, Mapping[str, float | None]]],
+    odds: Mapping[str, float],
+) -> dict[str, SeenEffect]:
+    """Effects from their ``stated`` probabilities. Of ``groups``, each a name with its
+    alternatives, one acts for certain: what the alternatives leave is the name's."""
+    probabilities = dict(stated)
+    for name, alternatives in groups:
+        probabilities |= alternatives
+        rest = [alternatives[other] for other in alternatives]
+        if probabilities.get(name) is None and None not in rest:
+            probabilities[name] = float(np.clip(1 - sum(p for p in rest if p is not None), 0.0, Odds().certain - EDGE))
+    return {name: SeenEffect(p, {}, odds.get(name, CATALOGUE_ODDS)) for name, p in probabilities.items()}
 
 
 def learned_odds(units: Sequence[SeenUnit], *, part_number: str | None = None) -> LearnedOdds:
@@ -101,7 +134,6 @@ def learned_odds(units: Sequence[SeenUnit], *, part_number: str | None = None) -
         part_number,
         len(units),
         {name: LearnedEffect(float(o), float(c)) for name, o, c in zip(names, odds, count, strict=True)},
-        CATALOGUE_ODDS,
         _unmodelled(units),
     )
 

@@ -19,6 +19,8 @@ CHANGE_POINTS = 40
 likeliest come later."""
 FROM_TO = 12
 """Of them, those that a passing change begins and ends with."""
+FEW_PAIRS = 300
+"""Pairs of runs that are summed one by one, not by a table of cells."""
 FEWEST = 5
 """Runs inside a place and time, and outside: fewer are single units."""
 
@@ -95,7 +97,7 @@ class TimeGrid:
 
     @classmethod
     def of(cls, time: Floats, finer: Sequence[float] = (), *, passing: bool = False) -> TimeGrid:
-        """``finer`` are further edges, about likely changes; of ``passing`` ones too."""
+        """``finer`` are further edges, about likely changes, also ``passing`` ones."""
         every = np.unique(time)
         between = (every[1:] + every[:-1]) / 2
         base = evenly_spread(np.sort(time), CHANGE_POINTS + 2)[1:-1]
@@ -194,9 +196,13 @@ class Sums:
         """(n,w,d) sums of ``value`` (p,d) over ``pairs`` (p,2) of runs that are both in
         the place and the window."""
         cells, windows = self.grid.cells, self.grid.windows
-        out = np.zeros((len(self.places.names), len(windows.first), value.shape[1]))
         low, high = np.sort(self.grid.cell[pairs], axis=1).T
-        both = np.array([self.places.inside(k)[pairs].all(axis=1) for k in range(len(out))])
+        both = np.array([self.places.inside(k)[pairs].all(axis=1) for k in range(len(self.places.names))])
+        if len(pairs) <= FEW_PAIRS:
+            during = (low[:, None] >= windows.first) & (high[:, None] < windows.end)
+            product = during[:, :, None] * value[:, None]
+            return np.asarray(np.tensordot(both.astype(float), product, axes=1))
+        out = np.zeros((len(self.places.names), len(windows.first), value.shape[1]))
         for place in np.flatnonzero(both.any(axis=1)):
             mine = both[place]
             table = np.zeros((cells * cells, value.shape[1]))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -61,7 +61,8 @@ class PlacePrior:
 @dataclass(frozen=True, eq=False)
 class Family:
     """Hypotheses of one form and pattern in the places of one kind: ``log`` (n,w) are
-    log evidences against nothing, with priors, by place and window (or ramp).
+    log evidences against nothing, with priors, by place and window (or ramp);
+    ``log_prior`` (n,w) are the latter.
 
     Of a shift or drift, ``score`` and ``information`` (n,w,r) are those of its r
     coefficients, ``vectors`` (r,d) or (N,d) what a unit of each adds to the components
@@ -72,6 +73,7 @@ class Family:
     pattern: str
     places: PlacesOfKind
     log: Floats
+    log_prior: Floats
     score: Floats | None = None
     information: Floats | None = None
     vectors: Floats | None = None
@@ -116,6 +118,11 @@ class Posterior:
                 yield family, int(place), int(window), float(p[place, window])
 
 
+EFFICIENCY = 0.37
+"""Of a median absolute deviation: degrees of freedom of a spread by runs."""
+FOR, TINY = 1.0, 1e-9
+"""Largest log evidence at which a hypothesis is not looked at; and least information
+that is not rounding."""
 NEGLIGIBLE = 12.0
 """Difference of log probabilities beyond which one does not matter."""
 LEAST_SHARE = 2e-3
@@ -309,7 +316,7 @@ class Search:
         cell = grid.cell[inside]
         acting = (cell >= first) & (cell < end)
         times = self.time[inside]
-        # A window that begins before all runs of the place, or ends after them, is open.
+        # Begun before all runs of the place, or ending after them, it is open.
         since = until = interval = None
         if (cell < first).any():
             since = _between(times[cell < first].max(), times[acting].min())
@@ -418,14 +425,44 @@ def _likelihoods(runs: Sequence[UnitRun]) -> dict[str, Floats]:
 
 
 def _log_evidence(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> Floats:
-    """(n,w) of r coefficients, normal with one size over √r, mean over the sizes."""
-    r = score.shape[-1]
+    """(n,w) of r coefficients, normal with one size over √r, mean over the sizes. −∞
+    where the evidence is against an effect: what is left out is a part of the prior
+    odds."""
+    chi2 = np.sum(score**2 / np.maximum(information, TINY), axis=-1)
+    out = np.full(chi2.shape, -np.inf)
+    some = chi2 > 2 * FOR
+    out[some] = _mean_evidence(score[some], information[some], sizes, scale)
+    return out
+
+
+def _mean_evidence(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> Floats:
     each = []
     for size in sizes:
-        variance = (size * scale) ** 2 / r
+        variance = (size * scale) ** 2 / score.shape[-1]
         spread = 1 + variance * information
         each.append(0.5 * np.sum(variance * score**2 / spread - np.log(spread), axis=-1))
     return np.asarray(log_sum_exp(np.array(each), axis=0) - np.log(len(sizes)))
+
+
+def _with_spread_estimated(families: Sequence[Family], dof: float) -> Iterator[Family]:
+    """Families whose evidences (without priors) suppose the spread between units
+    known, with priors and for a spread that is known with ``dof`` degrees of freedom:
+    Student's t of what the best hypothesis explains and another does not."""
+    best = max((float(f.log.max(initial=0.0, where=np.isfinite(f.log_prior))) for f in families), default=0.0)
+    nothing = -0.5 * dof * np.log1p(2 * best / dof)
+    for family in families:
+        short = np.maximum(best - family.log, 0.0)
+        with np.errstate(invalid="ignore"):
+            log = np.where(np.isfinite(family.log), -0.5 * dof * np.log1p(2 * short / dof) - nothing, -np.inf)
+        yield replace(family, log=log + family.log_prior)
+
+
+def _mean_of_levels(levels: Floats) -> Floats:
+    """(n,w) log mean over levels (n,w,l); −∞ where none is for the effect."""
+    out = np.full(levels.shape[:-1], -np.inf)
+    some = levels.max(axis=-1) > FOR
+    out[some] = log_sum_exp(levels[some], axis=-1) - np.log(levels.shape[-1])
+    return out
 
 
 def _coefficients(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> tuple[Floats, Floats]:
@@ -472,15 +509,15 @@ class _Level:
         outlier by what all effects leave."""
         self.search, self.given, self.grid, self.own = search, given, grid, own
         self.sums = [Sums(places, grid) for places in search.places]
-        self.allowed = [self._allowed(s) for s in self.sums]
         self.share_of_kinds = -np.log(max(len(self.sums), 1))
 
-    def _allowed(self, sums: Sums) -> Floats:
-        """(n,w) log priors of places and windows, −∞ where too few runs are in it or
-        outside."""
-        count = 1.0 / self.search.count
-        inside = sums.by_window(sums.by_cell(np.stack([np.ones_like(count), count], axis=1)))
-        total = np.array([len(count), count.sum()])
+    def _allowed(self, sums: Sums, known: Bools) -> Floats:
+        """(n,w) log priors of places and windows, −∞ where too few runs with a ``known``
+        figure (N,) are in it or outside."""
+        known = np.asarray(known, dtype=float)
+        count = known / self.search.count
+        inside = sums.by_window(sums.by_cell(np.stack([known, count], axis=1)))
+        total = np.array([known.sum(), count.sum()])
         enough = (inside[..., 0] >= FEWEST) & (inside[..., 1] >= UNITS)
         enough &= (total[0] - inside[..., 0] >= FEWEST) & (total[1] - inside[..., 1] >= UNITS)
         prior = self.grid.windows.log_prior - np.log(len(sums.places.names))
@@ -554,8 +591,12 @@ class _Level:
             return
         start -= np.log(len(self.search.groups))
         left, weight = self.residual(subject)
-        yield from self._means(subject, left, weight, start)
-        yield from self._scatter(subject, self._left(subject), start + np.log(prior.forms[Form.SCATTER]))
+        families = [
+            *self._means(subject, left, weight, start),
+            *self._scatter(subject, self._left(subject), start + np.log(prior.forms[Form.SCATTER])),
+        ]
+        known = (self.search.groups[subject].weight > 0).any(axis=1).sum()
+        yield from _with_spread_estimated(families, EFFICIENCY * float(known))
 
     def _means(self, g: int, left: Floats, weight: Floats, start: float) -> Iterator[Family]:
         search, group = self.search, self.search.groups[g]
@@ -563,8 +604,10 @@ class _Level:
         pull, ones = precise.times(left), precise.times(np.ones_like(left))
         pull = pull - ones * self._mean_by_part(pull, ones)
         patterns = list(_patterns(group, search.runs, search.part))
+        known = np.asarray((group.weight > 0).any(axis=1))
         pairs, between = search._same_unit, precise.between(search._same_unit)
-        for sums, allowed in zip(self.sums, self.allowed, strict=True):
+        for sums in self.sums:
+            allowed = self._allowed(sums, known)
             score = sums.by_cell(pull)
             information, taken = sums.by_cell(precise.diagonal), self._by_part(sums, ones, ones)
             for form in (Form.SHIFT, Form.DRIFT):
@@ -595,8 +638,8 @@ class _Level:
                     else:
                         index = np.flatnonzero(vectors.any(axis=0))
                         own_s, own_h = s[..., index], h[..., index]
-                    log = prior + _log_evidence(own_s, own_h, search.prior.sizes, scale)
-                    yield Family(form, g, name, sums.places, log, own_s, own_h, vectors, by_run, scale)
+                    log = _log_evidence(own_s, own_h, search.prior.sizes, scale)
+                    yield Family(form, g, name, sums.places, log, prior, own_s, own_h, vectors, by_run, scale)
 
     def _mean_by_part(self, pull: Floats, ones: Floats) -> Floats:
         out = np.zeros_like(pull)
@@ -638,13 +681,15 @@ class _Level:
         alone = group.group.figures if group.group.alone else ()
         prior = start - np.log(max(len(alone) + (len(group.mix) > 1), 1))
         of = dict(self._scatter_of_each(g, left, factors))
-        for sums, allowed in zip(self.sums, self.allowed, strict=True):
-            runs = sums.by_window(sums.by_cell(np.ones((len(left), 1))))[..., 0]
+        known = np.asarray((group.weight > 0).any(axis=1))
+        for sums in self.sums:
+            allowed = self._allowed(sums, known)
+            runs = sums.by_window(sums.by_cell(known[:, None].astype(float)))[..., 0]
             base = np.where(runs >= SCATTERING, allowed + prior, -np.inf)
             for name, gain in of.items():
                 levels = sums.by_window(sums.by_cell(gain))
-                log = log_sum_exp(levels, axis=2) - np.log(len(factors))
-                yield Family(Form.SCATTER, g, name, sums.places, base + log, levels=levels)
+                log = _mean_of_levels(levels)
+                yield Family(Form.SCATTER, g, name, sums.places, log, base, levels=levels)
 
     def _scatter_of_each(self, g: int, left: Floats, factors: Floats) -> Iterator[tuple[str, Floats]]:
         """(N,l) log density of each run with each factor against without, of each
@@ -690,10 +735,13 @@ class _Level:
         rates = np.array(self.search.prior.rates)
         now = np.log1p(base * (ratio - 1))[:, None]
         higher = np.where(rates > base[:, None], np.log1p(rates * (ratio[:, None] - 1)) - now, 0.0)
-        for sums, allowed in zip(self.sums, self.allowed, strict=True):
+        known = np.array([bool(run.effects) for run in self.search.runs], dtype=bool)
+        for sums in self.sums:
+            allowed = self._allowed(sums, known)
             levels = sums.by_window(sums.by_cell(higher))
-            log = log_sum_exp(levels, axis=2) - np.log(len(rates))
-            yield Family(Form.FREQUENCY, -1, name, sums.places, allowed + start + log, levels=levels)
+            log = _mean_of_levels(levels)
+            prior = allowed + start
+            yield Family(Form.FREQUENCY, -1, name, sums.places, prior + log, prior, levels=levels)
 
     def rate(self, name: str) -> Floats:
         """(N,) share of units with the effect: one for all, where no place has its

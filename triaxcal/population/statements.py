@@ -109,7 +109,7 @@ class PlacedEffects:
 
 def placed_effects(runs: Sequence[UnitRun], prior: PlacePrior | None = None) -> PlacedEffects:
     """Effects of places in these runs, in any order. Raises InvalidData for fewer than
-    thirty runs of one part number."""
+    sixty runs of one part number."""
     prior = prior or PlacePrior()
     used = _enough(runs)
     if not used:
@@ -128,7 +128,7 @@ def placed_effects(runs: Sequence[UnitRun], prior: PlacePrior | None = None) -> 
     )
 
 
-LEAST = 30
+LEAST = 60
 """Runs of a part number."""
 
 

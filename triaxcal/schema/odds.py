@@ -24,8 +24,10 @@ class LearnedOdds(Model):
     format: Annotated[Literal["triaxcal.odds/1"], Field(description="format of this document")]
     part_number: Annotated[Text | None, Field(description="part number of the units; `null` holds for any")]
     units: Annotated[int, Field(ge=1, description="number of units that they are learned from")]
-    effects: Annotated[dict[Text, LearnedEffect], Field(description="the odds of [each effect](effects.md), by name")]
-    others: Annotated[Odds, Field(description="odds of an effect that is not listed")]
+    effects: Annotated[
+        dict[Text, LearnedEffect],
+        Field(description="odds of [each effect](effects.md) by name; those of others are the catalogue's"),
+    ]
     unmodelled_probability: Annotated[
         Figure, Field(gt=0, le=0.5, description="probability of something that no effect describes, before any pose")
     ]
