@@ -14,6 +14,7 @@ import numpy as np
 
 from triaxcal.planning import directions
 from triaxcal.population.runs import PlaceKind, SeenEffect, SeenPoses, UnitRun
+from triaxcal.population.statements import Place, PlacedEffects, Statement, Verdict
 
 YEAR_S = 365.25 * 86400.0
 SPREAD = np.array([6e-3] * 3 + [3e-3] * 3 + [4e-3] * 3)
@@ -335,3 +336,57 @@ def _runs(draft: _Draft, poses: int, order: np.ndarray) -> list[UnitRun]:
             )
         )  # fmt: skip
     return out
+
+
+# What a model says of a world.
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Of one truth: ``named`` if a statement has its place alone, ``listed`` if a statement or a candidate has it among
+    its places, ``pattern`` if in one of these the figures that show it are the likeliest; ``since_off_s`` is how far the
+    change is off. ``statements`` are all of this truth's places."""
+
+    named: bool
+    listed: bool
+    pattern: bool
+    since_off_s: float | None
+    statements: tuple[Statement, ...]
+
+
+SAME = 0.9
+"""Share of runs that two places have in common if they are one: hours that nobody works at are in either."""
+
+
+def judged(made: World, k: int, found: PlacedEffects) -> Judgement:
+    truth, inside = made.truths[k], made.inside[k]
+    labels = {kind: np.array([run.place(kind) or "" for run in made.runs]) for kind in PlaceKind}
+    hour = np.array([run.hour or 0.0 for run in made.runs])
+    time = np.array([run.time_s for run in made.runs])
+
+    def is_truth(statement: Statement, place: Place) -> bool:
+        """Whether it is the place, or has the same runs in the time of the statement."""
+        if (place.kind, place.name) == (truth.kind, truth.name):
+            return True
+        during = np.ones(len(time), dtype=bool)
+        if statement.since_s is not None:
+            during &= time >= statement.since_s
+        if statement.until_s is not None:
+            during &= time <= statement.until_s
+        mine = of_place(place.kind, place.name, labels, hour) & during
+        return bool((mine & inside).sum() > SAME * (mine | inside).sum())
+
+    said = (*found.statements, *found.candidates)
+    of_place_ = [s for s in said if any(is_truth(s, place) for place in s.places)]
+    of_figures = [s for s in of_place_ if s.pattern.kind.value in truth.shows]
+    known = [s for s in of_figures if s.verdict is not Verdict.CANDIDATE]
+    off = None
+    if truth.since > 0 and known and known[0].since_s is not None:
+        off = known[0].since_s - truth.since * YEAR_S
+    return Judgement(
+        any(s.verdict is Verdict.NAMED for s in of_figures),
+        bool(of_place_),
+        bool(of_figures),
+        off,
+        tuple(of_place_),
+    )
