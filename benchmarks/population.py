@@ -92,8 +92,8 @@ def table(lines: Sequence[Line], empty: Sequence[Line]) -> Table:
     days = [abs(d) for line in lines for d in line.days]
     rows.append(["statements of other places", str(sum(len(line.wrong) for line in lines)), "", ""])
     rows.append(["median days off a change", f"{np.median(days):.1f}" if days else "", "", ""])
-    rows.append(["seconds a world, median and most",
-                 *(f"{f([line.seconds for line in (*lines, *empty)] or [0]):.1f}" for f in (np.median, np.max)), ""])  # fmt: skip
+    seconds = [line.seconds for line in (*lines, *empty)] or [0.0]
+    rows.append(["seconds a world, median and most", f"{np.median(seconds):.1f}", f"{max(seconds):.1f}", ""])
     rows.append(["empty worlds with anything named", share([bool(line.wrong) for line in empty]), "", ""])
     return Table("Effects of places", ("effect", "place named alone", "named or listed", "pattern too"), rows)
 

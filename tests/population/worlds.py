@@ -206,7 +206,7 @@ def _drift(draft: _Draft, inside: np.ndarray, size: float) -> None:
 
 
 def _frequency(draft: _Draft, inside: np.ndarray, size: float) -> None:
-    draft.rate[inside, int(draft.rng.integers(3))] = min(0.1 * size, 0.9)
+    draft.rate[inside, int(draft.rng.integers(3))] = min(0.1 + 0.08 * size, 0.9)
 
 
 def _coefficient_of_effect(draft: _Draft, inside: np.ndarray, size: float) -> None:
@@ -312,11 +312,12 @@ def _runs(draft: _Draft, poses: int, order: np.ndarray) -> list[UnitRun]:
         for k, name in enumerate(EFFECTS):
             acts = has[u, k] < draft.rate[i, k]
             p = 1 - 10 ** rng.uniform(-4, -1.2) if acts else 10 ** rng.uniform(-3.5, -1.5)
-            value = 1.0 + 0.1 * draft.of_effect[i] + 0.1 * rng.normal() if acts else 0.0
+            value = 1.0 + 0.1 * rng.normal() if acts else 0.0
             effects[name] = SeenEffect(float(p), {"x": (value, 0.02)} if acts else {}, 0.3 / 23)
         # Everybody has coefficients of temperature.
+        seen_per_k = per_k[u] + np.eye(9)[6] * draft.of_effect[i] * PER_K[6]
         effects["temperature_bias"] = SeenEffect(
-            0.999, {a: (float(per_k[u, 6 + k] + rng.normal() * 1e-5), 1e-5) for k, a in enumerate("xyz")}, 0.3 / 23
+            0.999, {a: (float(seen_per_k[6 + k] + rng.normal() * 1e-5), 1e-5) for k, a in enumerate("xyz")}, 0.3 / 23
         )
         effects["temperature_scale_factor"] = SeenEffect(
             0.999, {a: (float(per_k[u, k] + rng.normal() * 1e-5), 1e-5) for k, a in enumerate("xyz")}, 0.3 / 23
@@ -344,8 +345,8 @@ def _runs(draft: _Draft, poses: int, order: np.ndarray) -> list[UnitRun]:
 @dataclass(frozen=True)
 class Judgement:
     """Of one truth: ``named`` if a statement has its place alone, ``listed`` if a statement or a candidate has it among
-    its places, ``pattern`` if in one of these the figures that show it are the likeliest; ``since_off_s`` is how far the
-    change is off. ``statements`` are all of this truth's places."""
+    its places, ``pattern`` if in one of these the figures that show it are the likeliest; ``since_off_s`` is how far
+    the change is off. ``statements`` are all of this truth's places."""
 
     named: bool
     listed: bool

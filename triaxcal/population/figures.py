@@ -363,12 +363,14 @@ BEST = 0.02
 
 
 def _repeatability(z: Floats, weight: Floats, same_unit: Ints, noise: Floats) -> Floats:
-    """(d,) share of the variance that runs of one unit differ by; without repeats
-    that of the noise of the runs."""
-    floor = np.maximum(noise, BEST)
-    if len(same_unit) < REPEATS:
-        return np.minimum(floor, 1.0)
+    """(d,) share of the variance that runs of one unit differ by, with two standard
+    errors of its estimate, and at least that of the ``noise``; all of it where too few
+    units repeat."""
+    out = np.ones(z.shape[1])
     known = (weight[same_unit] > 0).all(axis=1)
+    count = known.sum(axis=0)
     differences = np.where(known, (z[same_unit[:, 0]] - z[same_unit[:, 1]]) ** 2 / 2, np.nan)
-    found = _median(differences) / CHI2_MEDIAN
-    return np.where(known.sum(axis=0) >= REPEATS, np.clip(np.maximum(found, floor), BEST, 1.0), np.minimum(floor, 1.0))
+    found = _median(differences) / CHI2_MEDIAN * (1 + 2 / np.sqrt(np.maximum(count, 1)))
+    shown = count >= REPEATS
+    out[shown] = np.clip(np.maximum(found, noise)[shown], BEST, 1.0)
+    return out

@@ -143,7 +143,7 @@ LARGEST_FACTOR = 30.0
 UNKNOWN_LIKELY, UNLISTED = 0.5, 0.05
 """Probability of an effect that is likely and not calibrated; and likelihood ratio of
 one that a run does not list."""
-SWEEPS, MORE_SWEEPS = 3, 2
+SWEEPS, MORE_SWEEPS = 2, 2
 """Passes over all single effects after a further one, and over them in the end: each
 changes them less."""
 FINER = 10
@@ -160,6 +160,8 @@ class SingleEffect:
     scale: dict[int, tuple[Floats, Floats]]
     rate: dict[str, Floats]
     finer: tuple[float, ...] = ()
+    after: tuple[tuple[SingleEffect, ...], tuple[float, ...]] | None = None
+    """The effects, and the moments, that it was last found with."""
     factor: float = 1.0
     factor_error: float = 0.0
     """Of more scatter, under the likeliest hypothesis, with its standard error."""
@@ -196,6 +198,8 @@ class Search:
             standardised(g, self.part, self._followers, self._same_unit, fitted.get(i)) for i, g in enumerate(self._raw)
         ]
         self.subjects: list[int | str] = [*range(len(self.groups)), *self.likelihood]
+        self.of_residuals = {i for i, g in enumerate(self._raw) if g.kind in (FigureKind.CONVERTER, FigureKind.POSES)}
+        """Groups that are two views of the same residuals."""
         self._cache: dict[int | str, tuple[tuple[SingleEffect, ...], list[Family]]] = {}
 
     # The passes.
@@ -273,6 +277,11 @@ class Search:
     def _again(self, effect: SingleEffect) -> SingleEffect | None:
         """The effect, given all others, with finer moments: among what it may be."""
         finer = self._finer(effect)
+        subjects = self._subjects_of(effect)
+        others = [other for other in self.effects if other is not effect]
+        after = tuple(other for other in others if any(other.acts_on(s) for s in subjects)), finer
+        if effect.after == after:  # nothing has changed for it
+            return effect
         family, _, window = effect.posterior.best()
         windows = effect.posterior.grid.windows
         passing = (
@@ -281,10 +290,18 @@ class Search:
             and windows.end[window] < effect.posterior.grid.cells
         )
         grid = TimeGrid.of(self.time, finer, passing=bool(passing))
-        level = _Level(self, [other for other in self.effects if other is not effect], grid, effect)
-        subjects = {family.subject for family, _ in effect.posterior.families()}
-        families = [family for subject in self.subjects if subject in subjects for family in level.of(subject)]
-        return self._effect(level, families, grid, finer)
+        level = _Level(self, others, grid, effect)
+        found = self._effect(level, [family for subject in subjects for family in level.of(subject)], grid, finer)
+        if found is not None:
+            found.after = after
+        return found
+
+    def _subjects_of(self, effect: SingleEffect) -> list[int | str]:
+        """What it may be of: patterns of residuals compete with each other."""
+        found = {family.subject for family, _ in effect.posterior.families()}
+        if found & self.of_residuals:
+            found |= self.of_residuals
+        return [subject for subject in self.subjects if subject in found]
 
     def _effect(
         self, level: _Level, families: Sequence[Family], grid: TimeGrid, finer: tuple[float, ...]
@@ -512,8 +529,8 @@ class _Level:
         self.share_of_kinds = -np.log(max(len(self.sums), 1))
 
     def _allowed(self, sums: Sums, known: Bools) -> Floats:
-        """(n,w) log priors of places and windows, −∞ where too few runs with a ``known``
-        figure (N,) are in it or outside."""
+        """(n,w) log priors of places and windows, −∞ where too few runs are in it, or
+        outside, of which the figure is ``known`` (N,)."""
         known = np.asarray(known, dtype=float)
         count = known / self.search.count
         inside = sums.by_window(sums.by_cell(np.stack([known, count], axis=1)))
@@ -794,6 +811,7 @@ class _Level:
             sizes = log_scale.setdefault(family.group, (np.zeros((n, len(group.mix))), np.zeros((n, len(group.back)))))
             sizes[0][:] += share[:, None] * np.log(of_components)
             sizes[1][:] += share[:, None] * np.log(of_figures)
+        self._take_all_residuals(posterior, added, acts)
         scale = {g: (np.exp(a), np.exp(b)) for g, (a, b) in log_scale.items()}
         best, place, window = posterior.best()
         if best.form is not Form.SCATTER:
@@ -801,7 +819,28 @@ class _Level:
         factor = self.factor(best, place, window)
         # The median of squares is known to 1.17 / √n of it, its root to half of that.
         error = factor * 1.17 / np.sqrt(max(float(self._in_time(best, place, window).sum()), 1.0))
-        return SingleEffect(posterior, added, scale, rate, finer, factor, float(error))
+        return SingleEffect(posterior, added, scale, rate, finer, factor=factor, factor_error=float(error))
+
+    def _take_all_residuals(self, posterior: Posterior, added: dict[int, Floats], acts: float) -> None:
+        """A pattern of residuals at a place is one effect, whatever else it looks like:
+        all that the residuals do in that place and time is taken off with it."""
+        search = self.search
+        inside = np.zeros(len(search.runs))
+        for family, place, window, p in posterior.likely():
+            if family.group in search.of_residuals and family.form in (Form.SHIFT, Form.DRIFT):
+                inside += self._in_time(family, place, window) * p * acts
+        if not inside.any():
+            return
+        for g in search.of_residuals:
+            left, weight = self._left(g), search.groups[g].weight
+            # Least squares on the place, with a free mean, without outliers.
+            for _ in range(3):
+                total = np.maximum(weight.sum(axis=0), TINY)
+                about = inside[:, None] - (weight * inside[:, None]).sum(axis=0) / total
+                centred = left - (weight * left).sum(axis=0) / total
+                shift = (weight * about * centred).sum(axis=0) / np.maximum((weight * about**2).sum(axis=0), TINY)
+                weight = search.groups[g].weight * _t_weight(centred - about * shift)
+            added[g] = inside[:, None] * shift
 
     def factor(self, family: Family, place: int, window: int) -> float:
         """The factor of more scatter: the median of the squares inside over that
