@@ -124,7 +124,7 @@ def test_repeated_units_tell_a_small_shift_that_different_units_hide() -> None:
 
 def test_runs_of_too_few_units_are_refused_and_rare_part_numbers_left_out() -> None:
     runs = runs_at([("S1", "F1")] * 59, np.zeros(59))
-    with pytest.raises(tc.InvalidData, match="sixty"):
+    with pytest.raises(tc.InvalidData, match="need 60"):
         placed_effects(runs)
     more = runs_at([("S1", "F1")] * 70, np.zeros(70))
     rare = [replace(run, part_number="rare") for run in runs[:8]]

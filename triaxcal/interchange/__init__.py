@@ -34,11 +34,11 @@ from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
-    from triaxcal.interchange.population_documents import odds_document, odds_of, seen_unit_in
+    from triaxcal.interchange.population_documents import odds_document, odds_of, seen_unit_in, unit_run_in
 
 _NAMES = {
     "pooled_documents": ("agreement_document", "with_recordings"),
-    "population_documents": ("odds_document", "odds_of", "seen_unit_in"),
+    "population_documents": ("odds_document", "odds_of", "seen_unit_in", "unit_run_in"),
 }
 """They import the posterior, which most commands do not need."""
 
@@ -70,6 +70,7 @@ __all__ = [
     "seen_unit_in",
     "sensor_of",
     "turning_document",
+    "unit_run_in",
     "with_recordings",
 ]
 

@@ -13,6 +13,7 @@ from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.evidence.prior import Odds
 from triaxcal.population import LearnedEffect, LearnedOdds, SeenEffect, SeenUnit, learned_odds
 from triaxcal.population.odds import CATALOGUE_ODDS, LEAST, MOST
+from triaxcald.documents import loop_document
 
 NAMES = [effect.name for effect in CATALOGUE[:6]]
 
@@ -110,3 +111,34 @@ def test_diagnose_takes_odds_as_they_are_as_a_document_and_as_a_file(tmp_path: P
     seen = SeenUnit.of(tc.diagnosis.diagnose(poses, odds=learned.prior))
     assert seen.effects[name].prior_odds == 0.5
     assert seen.unmodelled_prior == 0.05 != Odds().unmodelled_probability
+
+
+@pytest.mark.slow
+def test_a_loop_document_says_what_its_loop_says() -> None:
+    up = np.array([v for _, v in tc.planning.directions(26)], dtype=float)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    rng = np.random.default_rng(4)
+    u = 4096 * (up + 2e-4 * up**2 + [3e-3, 0.0, -1e-3]) + rng.normal(size=up.shape) * 0.05
+    poses = tc.Poses.of_means(
+        u,
+        t=12.0 * np.arange(26),
+        standard_errors=np.full(u.shape, 0.05),
+        channels={"temp_c": 22 + 0.01 * np.arange(26)},
+    )
+    loop = tc.diagnosis.diagnose(poses)
+    document = loop_document(loop, output_unit="counts")
+    by_loop, by_document = SeenUnit.of(loop), tc.interchange.seen_unit_in(document, where="x")
+    for name, seen in by_loop.effects.items():
+        other = by_document.effects[name].probability
+        if seen.probability is None or other is None:
+            assert seen.probability is other
+        else:
+            assert other == pytest.approx(seen.probability, abs=2e-3)
+    run = tc.interchange.unit_run_in(document, serial="1", time_s=5.0, where="x", station="S", hour=3.0)
+    assert np.allclose(run.coefficients[:3], 4096, rtol=1e-3)
+    assert run.poses is not None
+    assert run.poses.planned is not None
+    assert np.allclose(np.sum(run.poses.planned * run.poses.measured, axis=1), 1, atol=1e-3)
+    assert run.effects["second_order_nonlinearity"].probability == pytest.approx(1.0, abs=0.01)
+    with pytest.raises(tc.InvalidData):
+        tc.interchange.seen_unit_in({"format": "triaxcal.poses/1"}, where="x")
