@@ -206,7 +206,8 @@ def _drift(draft: _Draft, inside: np.ndarray, size: float) -> None:
 
 
 def _frequency(draft: _Draft, inside: np.ndarray, size: float) -> None:
-    draft.rate[inside, int(draft.rng.integers(3))] = min(0.1 + 0.08 * size, 0.9)
+    k = int(draft.rng.integers(3))
+    draft.rate[inside, k] = np.maximum(draft.rate[inside, k], min(0.1 + 0.08 * size, 0.9))
 
 
 def _coefficient_of_effect(draft: _Draft, inside: np.ndarray, size: float) -> None:
@@ -311,7 +312,7 @@ def _runs(draft: _Draft, poses: int, order: np.ndarray) -> list[UnitRun]:
         effects = {}
         for k, name in enumerate(EFFECTS):
             acts = has[u, k] < draft.rate[i, k]
-            p = 1 - 10 ** rng.uniform(-4, -1.2) if acts else 10 ** rng.uniform(-3.5, -1.5)
+            p = 1 - 10 ** rng.uniform(-4, -1.2) if acts else 10 ** rng.uniform(-4.5, -2.2)
             value = 1.0 + 0.1 * rng.normal() if acts else 0.0
             effects[name] = SeenEffect(float(p), {"x": (value, 0.02)} if acts else {}, 0.3 / 23)
         # Everybody has coefficients of temperature.

@@ -48,7 +48,7 @@ class PlacePrior:
     larger one is found as well. A factor of 3 changes the evidence little."""
     factors: tuple[float, ...] = (1.3, 1.7, 2.5, 4.0, 8.0)
     """Factors of more scatter."""
-    rates: tuple[float, ...] = (0.03, 0.1, 0.3, 0.6, 0.9)
+    rates: tuple[float, ...] = (0.005, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9)
     """Shares of units with an effect."""
     forms: Mapping[Form, float] = field(
         default_factory=lambda: {Form.SHIFT: 0.55, Form.DRIFT: 0.15, Form.SCATTER: 0.15, Form.FREQUENCY: 0.15}
@@ -358,7 +358,7 @@ class Search:
             return {family.pattern: (effect.factor, effect.factor_error, "1", float("nan"))}
         if family.score is None or family.information is None or family.vectors is None:
             assert family.levels is not None
-            rates = np.array(self.prior.rates)
+            rates = np.array(self.prior.rates[1:])
             log = family.levels[place, window]
             weight = np.exp(log - log_sum_exp(log))
             rate = float(weight @ rates)
@@ -748,31 +748,27 @@ class _Level:
         return _in_robust_spreads(figures), _in_robust_spreads(components)
 
     def _frequency(self, name: str, start: float) -> Iterator[Family]:
-        ratio, base = self.search.likelihood[name], self.rate(name)
-        rates = np.array(self.search.prior.rates)
-        now = np.log1p(base * (ratio - 1))[:, None]
-        higher = np.where(rates > base[:, None], np.log1p(rates * (ratio[:, None] - 1)) - now, 0.0)
-        known = np.array([bool(run.effects) for run in self.search.runs], dtype=bool)
-        for sums in self.sums:
-            allowed = self._allowed(sums, known)
-            levels = sums.by_window(sums.by_cell(higher))
-            log = _mean_of_levels(levels)
-            prior = allowed + start
-            yield Family(Form.FREQUENCY, -1, name, sums.places, prior + log, prior, levels=levels)
-
-    def rate(self, name: str) -> Floats:
-        """(N,) share of units with the effect: one for all, where no place has its
-        own."""
-        ratio, own = self.search.likelihood[name], np.zeros(len(self.search.runs))
+        """A share of units in the place, and a smaller one elsewhere, against one for
+        all; each of the shares is as probable."""
+        ratio, rates = self.search.likelihood[name][:, None], np.array(self.search.prior.rates)
+        own = np.zeros((len(ratio), 1))
         for effect in self.given:
             if name in effect.rate:
-                own = np.maximum(own, effect.rate[name])
-        free, rate = own == 0, EFFECT_ODDS / len(CATALOGUE)
-        if free.any():
-            for _ in range(20):  # expectation and maximisation, with a unit of the catalogue
-                acting = rate * ratio[free] / (1 + rate * (ratio[free] - 1))
-                rate = (acting.sum() + EFFECT_ODDS / len(CATALOGUE)) / (free.sum() + 1)
-        return np.where(free, rate, own)
+                own = np.maximum(own, effect.rate[name][:, None])
+        # Runs that another effect claims keep at least its share.
+        within = np.log1p(np.maximum(rates, own) * (ratio - 1))
+        elsewhere = np.log1p(np.where(own > 0, own, rates) * (ratio - 1))
+        every = elsewhere.sum(axis=0)
+        alike = log_sum_exp(every) - np.log(len(rates))
+        pairs = len(rates) * (len(rates) - 1) / 2
+        known = np.array([bool(run.effects) for run in self.search.runs], dtype=bool)
+        for sums in self.sums:
+            inside = sums.by_window(sums.by_cell(within))
+            outside = every - sums.by_window(sums.by_cell(elsewhere))
+            smaller = np.logaddexp.accumulate(outside, axis=2)[..., :-1]
+            levels = inside[..., 1:] + smaller - np.log(pairs / (len(rates) - 1)) - alike
+            prior = self._allowed(sums, known) + start
+            yield Family(Form.FREQUENCY, -1, name, sums.places, prior + _mean_of_levels(levels), prior, levels=levels)
 
     # The effect from its posterior.
 
@@ -799,7 +795,7 @@ class _Level:
             weight = np.exp(family.levels[place, window] - log_sum_exp(family.levels[place, window]))
             if family.form is Form.FREQUENCY:
                 own = rate.setdefault(family.pattern, np.zeros(n))
-                own += share * float(weight @ np.array(search.prior.rates))
+                own += share * float(weight @ np.array(search.prior.rates[1:]))
                 continue
             group = search.groups[family.group]
             factor = self.factor(family, place, window)
