@@ -40,7 +40,7 @@ def test_gravity_that_is_wrong_at_one_station_is_one_factor_of_three_scale_facto
     found = placed_effects(made.runs)
     assert judged(made, 0, found).listed
     (statement,) = found.statements
-    assert (statement.pattern.form, statement.pattern.name) == (Form.SHIFT, "common factor of scale factors")
+    assert (statement.pattern.form, statement.pattern.name) == (Form.SHIFT, "common_factor")
     (factor,) = statement.sizes.values()
     assert abs(abs(factor.value) / 6e-3 / made.truths[0].size - 1) < 0.25
     assert 0 < factor.uncertainty < 0.2 * abs(factor.value)

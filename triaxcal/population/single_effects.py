@@ -387,7 +387,7 @@ ROUNDING = 1e-6
 """Share of the largest uncertainty below which one is rounding."""
 SHOWN = 3.0
 """Standard uncertainties from which on a figure of several is shown."""
-COMMON_FACTOR, THERMOMETER = "common factor of scale factors", "temperature"
+COMMON_FACTOR, THERMOMETER = "common_factor", "temperature"
 SEVERAL = "several"
 UNIT_OF_RUNS = {COMMON_FACTOR: "", THERMOMETER: "K"}
 

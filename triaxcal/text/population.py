@@ -13,6 +13,7 @@ from triaxcal.text.advice import chance
 
 SHOWN = 3
 """Figures of a pattern of several that a line has: the largest."""
+NAMES: Mapping[str, str] = {COMMON_FACTOR: "common factor"}
 MEANINGS: Mapping[str, str] = {
     COMMON_FACTOR: "as with a wrong magnitude of the reference",
     THERMOMETER: "in proportion to each unit's coefficients of temperature, as with a wrong thermometer",
@@ -72,5 +73,6 @@ def lines(found: PlacedEffects, day: Callable[[float], str]) -> list[str]:
 
 
 def _size(name: str, change: Change) -> str:
+    name = NAMES.get(name, name)
     unit = f" {change.unit}" if change.unit not in ("", "1") else ""
     return f"{name} {plain(change.value, 3)} ± {plain(change.uncertainty, 2)}{unit}"
