@@ -13,7 +13,7 @@ from triaxcal import text, uncertainty
 from triaxcal.arrays import Floats, rms
 from triaxcal.diagnosis import Candidate, Finding, Recommendation
 from triaxcal.diagnosis import diagnose as diagnosed
-from triaxcal.documents import Calibration, earlier_of
+from triaxcal.documents import Calibration, earlier_of, learned_odds_in
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
@@ -234,6 +234,7 @@ def diagnose(
     reference: float = 1.0,
     check: Any = None,
     at: str | float = "end",
+    odds: Any = None,
     channels: Mapping[str, Any] | None = None,
     time_unit: str | None = None,
     columns: Mapping[str, str] | None = None,
@@ -246,6 +247,8 @@ def diagnose(
     The arguments are those of `calibrate`. ``check`` has poses of another recording,
     or a table of its samples, for the hold-out error. ``at`` is the moment for which
     effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
+    ``odds`` are those that `triaxcal.population.learned_odds` learned, or their
+    document (`triaxcal.odds/1`), or its file: they replace the odds of the catalogue.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     try:
@@ -256,7 +259,14 @@ def diagnose(
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
     others = None if check is None else _poses(check)
     output_unit = output_unit or _unit_of(poses)
-    loop = diagnosed(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
+    loop = diagnosed(
+        found,
+        signs=_signs(signs),
+        reference=_positive(reference),
+        check=others,
+        at=moment,
+        odds=None if odds is None else learned_odds_in(odds).prior,
+    )
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
         for c in (loop.before, loop.after)

@@ -41,6 +41,8 @@ from triaxcal.uncertainty.propagation import uncertainty_of_magnitude, uncertain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from triaxcal.population.odds import LearnedOdds
+
 RETURNS = 1e-6
 """How far a reading may be off, relative to its size, that is made from its own
 specific force."""
@@ -443,6 +445,19 @@ def earlier_of(calibration: Calibration, name: str = "", *, sha256: str = "", re
     document = calibration.to_dict()
     sha256 = sha256 or hashlib.sha256(to_text(document).encode()).hexdigest()
     return earlier_in(document, Origin(name, sha256, recording), where=name or "document")
+
+
+def learned_odds_in(odds: LearnedOdds | Mapping[str, Any] | str | os.PathLike[str]) -> LearnedOdds:
+    """Learned odds, as they are, from their document, or from its file. Raises
+    InvalidData, OSError."""
+    from triaxcal.interchange.population_documents import odds_of  # the posterior, which nothing else here needs
+    from triaxcal.population.odds import LearnedOdds
+
+    if isinstance(odds, LearnedOdds):
+        return odds
+    if isinstance(odds, Mapping):
+        return odds_of(odds, where="odds")
+    return odds_of(read_document(Path(odds)), where=str(odds))
 
 
 def read_document(path: Path) -> Mapping[str, Any]:

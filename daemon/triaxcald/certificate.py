@@ -37,6 +37,7 @@ from triaxcald.software import software as software
 from triaxcald.station.config import Limits, StationFile
 
 if TYPE_CHECKING:  # the models are loaded when a document is made
+    from triaxcald.learned_odds import OddsFile
     from triaxcald.schema.certificate import CorrectionOfCertificate, RegistersOfCertificate
 
 DAY_S = 86_400
@@ -88,12 +89,13 @@ def certify(
     computed_with: Mapping[str, str],
     earlier: tc.inputs.Earlier | None = None,
     at_start: Mapping[str, bytes] | None = None,
+    odds: OddsFile | None = None,
 ) -> Certified:
     """``computed_with``: `software` of the station, so that an audit years
     later can get the same bytes. ``earlier``: the calibration of which the
     poses renew the biases alone. ``at_start``: the registers by which the device
     corrected while the poses were taken, where its profile has a form of
-    correction.
+    correction. ``odds`` are learned ones.
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
@@ -111,7 +113,10 @@ def certify(
     poses = removed_from(profile, poses, at_start)
     loop = updated = None
     if earlier is None:
-        loop = tc.diagnosis.diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
+        loop = tc.diagnosis.diagnose(
+            poses, signs=signs, reference=station.reference, at=station.moment,
+            odds=None if odds is None else odds.prior,
+        )  # fmt: skip
         after = loop.after
     else:
         after = updated = tc.inputs.updated_biases(poses, earlier)
@@ -126,8 +131,9 @@ def certify(
     else:
         beside = held.beside_process if held else None
         result = loop_document(
-            loop, data_quality=quality, output_unit=output_unit, stated=stated, held_by_device=beside
-        )
+            loop, data_quality=quality, output_unit=output_unit, stated=stated, held_by_device=beside,
+            odds=None if odds is None else odds.document,
+        )  # fmt: skip
     outside = over_limits(result["after"], station.limits)
     identity, rounded = profile.identity, tc.rounding.number
     document = Certificate(

@@ -62,10 +62,12 @@ def loop_document(
     held_by_device: tc.estimate.Calibration | None = None,
     remarks: Sequence[str] = (),
     unit_in_doubt: bool = False,
+    odds: tc.interchange.Document | None = None,
 ) -> tc.interchange.Document:
     """``held_by_device`` is the calibration that a device has registers for,
     None where there is no such device. ``remarks`` are warnings besides those
-    of the fit; ``unit_in_doubt``: one of them asks whether it is one unit."""
+    of the fit; ``unit_in_doubt``: one of them asks whether it is one unit. ``odds``
+    are those that were learned, where the loop was found by them."""
     calibration = tc.interchange.calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
@@ -81,6 +83,8 @@ def loop_document(
     given: dict[str, Any] = {}  # keys that most loops do without
     if loop.held_out:
         given["held_out"] = _held_out(loop.held_out, following.expanded_uncertainty, reference)
+    if odds is not None:
+        given["odds"] = tc.schema.OddsUsed.model_validate(odds)
     if unit_in_doubt or loop.found.change_point:
         given["doubts"] = [UNIT]
     return tc.schema.Loop(

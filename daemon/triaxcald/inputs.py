@@ -22,12 +22,13 @@ from triaxcald.raw_to_poses import Pipeline, of_poses, together
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.reader import Contents, is_recording, open_recording
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION
-from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
+from triaxcald.recording.schema import ODDS_FILE, PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, UNCONFIRMED, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.station.config import parse_station
 from triaxcald.stores import path_of
 from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
+from triaxcald.work import RECORD as WORK_RECORD
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 PROFILE = PROFILE_FILE
@@ -46,6 +47,7 @@ class Measured:
     was read. ``at_start`` are the registers by which the device corrected the
     readings; the poses are of the readings before that. ``parted`` gives the same
     for another ``turn_s``, as for `find_spans`; None where poses are all that was read.
+    ``odds`` is the file of learned odds that a `run` had, ``part_number`` the unit's.
     """
 
     name: str
@@ -64,6 +66,8 @@ class Measured:
     too_short: tc.TooShort | None = None
     unconfirmed: str = ""
     parted: Callable[[float | None], Measured] | None = None
+    odds: bytes | None = None
+    part_number: str | None = None
 
 
 def measure(
@@ -173,6 +177,8 @@ def _measure_recording(
     read = Measured(
         recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at, at_start,
         too_short=pipeline.too_short(), unconfirmed=_mostly_unconfirmed(recording, phase, used),
+        odds=recording.attachments.get(ODDS_FILE),
+        part_number=recording.metadata.get(WORK_RECORD, {}).get("part_number") or None,
     )  # fmt: skip
 
     def parted(turn_s: float | None) -> Measured:

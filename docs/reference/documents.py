@@ -38,6 +38,7 @@ MODELS: dict[str, type[tc.schema.Model]] = {
     "calibration": tc.schema.Calibration,
     "loop": tc.schema.Loop,
     "rezero": tc.schema.Rezero,
+    "odds": tc.schema.LearnedOdds,
     "certificate": Certificate,
     "verification": Verification,
     "outcome": Outcome,
@@ -107,6 +108,13 @@ Coefficients ending in `_run2` act in the second recording alone. `run_bias` and
 ## Rezero
 
 After `run --rezero` the `result` of a certificate is a `triaxcal.rezero/1`. It has the keys of a loop that are listed here:
+
+"""  # noqa: E501
+ODDS = """# Learned odds
+
+`triaxcal fleet -o` writes `triaxcal.odds/1`; `diagnose --odds`, `run --odds`, the station key `odds` and `tc.diagnose(poses, odds=…)` take it ([how](../how-to/diagnose-several-recordings.md#odds-of-a-type)).
+
+Made from the model in `triaxcal/schema/odds.py` by `docs/reference/documents.py`; [JSON Schema](odds.schema.json).
 
 """  # noqa: E501
 CERTIFICATE = """# Certificate
@@ -218,6 +226,7 @@ def pages() -> dict[Path, str]:
         "poses": POSES + _keys(tc.schema.Poses),
         "calibration": CALIBRATION + _keys(tc.schema.Calibration) + METHODS,
         "loop": LOOP + _keys(tc.schema.Loop) + REZERO + _keys(tc.schema.Rezero, but=tc.schema.Loop),
+        "odds": ODDS + _keys(tc.schema.LearnedOdds),
         "certificate": CERTIFICATE + _keys(Certificate) + VERIFICATION + _keys(Verification),
         "outcome": _outcome(),
         "run": RUN + _keys(Run) + DEMO + _keys(Demo, but=Run),

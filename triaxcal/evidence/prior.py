@@ -3,7 +3,8 @@ table, each with its reason."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from triaxcal.effects.odds import EFFECT_ODDS, ON_ONE_AXIS, ON_TWO_AXES, SIZES, SMALLEST
 from triaxcal.rounding import reaches
@@ -22,6 +23,9 @@ class Odds:
     effect_odds: float = EFFECT_ODDS
     """Odds that some effect of the catalogue acts, shared evenly among the possible
     names; also of a second effect."""
+    of_effects: Mapping[str, float] = field(default_factory=dict)
+    """Odds of single effects in place of their even share, learned from units of the
+    type (`triaxcal.population`)."""
     pooled_effect_probability: float = 0.3
     """Probability that one effect acts in all of several units, shared among the
     possible names; otherwise the units are independent."""
@@ -90,6 +94,10 @@ class Odds:
     window: float = 1e4
     """Sets that are less probable than the best by this factor are excluded (Occam's
     window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89:1535)."""
+
+    def of_effect(self, name: str, count: int) -> float:
+        """Odds that an effect acts, one of ``count`` possible names."""
+        return self.of_effects.get(name, self.effect_odds / max(count, 1))
 
     def hangs_on_one_pose(self, probability: float) -> bool:
         """Whether a candidate of this probability would be certain without some single

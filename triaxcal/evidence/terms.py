@@ -244,8 +244,8 @@ def terms_of(
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
         still = still | {TIME, SINCE_START}
     able = [e for e in catalogue if all(name in known and name not in still for name in e.needs)]
-    share = np.log(odds.effect_odds / max(len(able), 1))
-    terms = [term for effect in able for term in _of_effect(rows, effect, share, odds, finer)]
+    share = {e.name: float(np.log(odds.of_effect(e.name, len(able)))) for e in able}
+    terms = [term for effect in able for term in _of_effect(rows, effect, share[effect.name], odds, finer)]
     return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds, near)]
 
 

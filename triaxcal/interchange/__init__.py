@@ -34,9 +34,13 @@ from triaxcal.lazy import lazily
 
 if TYPE_CHECKING:
     from triaxcal.interchange.pooled_documents import agreement_document, with_recordings
+    from triaxcal.interchange.population_documents import odds_document, odds_of, seen_unit_in, unit_run_in
 
-_NAMES = {"pooled_documents": ("agreement_document", "with_recordings")}
-"""They import the diagnosis, which most commands do not need."""
+_NAMES = {
+    "pooled_documents": ("agreement_document", "with_recordings"),
+    "population_documents": ("odds_document", "odds_of", "seen_unit_in", "unit_run_in"),
+}
+"""They import the posterior, which most commands do not need."""
 
 __all__ = [
     "WEIGHT",
@@ -58,11 +62,15 @@ __all__ = [
     "holds_of",
     "linear_errors_of",
     "logged_in",
+    "odds_document",
+    "odds_of",
     "poses_document",
     "reference_unit_in",
     "residual_document",
+    "seen_unit_in",
     "sensor_of",
     "turning_document",
+    "unit_run_in",
     "with_recordings",
 ]
 

@@ -1,5 +1,6 @@
 """What only many units show: distributions, control charts, capability, gauge studies
-and drift, from figures of units to values. No I/O, no clock."""
+and drift; effects of places and times; the odds of effects for the next unit of a type.
+From figures of units to values. No I/O, no clock."""
 
 from __future__ import annotations
 
@@ -57,6 +58,18 @@ if TYPE_CHECKING:
         Source,
         gauge_study,
     )
+    from triaxcal.population.odds import LearnedEffect, LearnedOdds, SeenUnit, learned_odds
+    from triaxcal.population.runs import PlaceKind, SeenEffect, SeenPoses, UnitRun
+    from triaxcal.population.single_effects import Form, PlacePrior
+    from triaxcal.population.statements import (
+        Change,
+        Pattern,
+        Place,
+        PlacedEffects,
+        Statement,
+        Verdict,
+        placed_effects,
+    )
 
 _NAMES = {
     "capability": (
@@ -108,6 +121,10 @@ _NAMES = {
         "Source",
         "gauge_study",
     ),
+    "odds": ("LearnedEffect", "LearnedOdds", "SeenUnit", "learned_odds"),
+    "runs": ("PlaceKind", "SeenEffect", "SeenPoses", "UnitRun"),
+    "single_effects": ("Form", "PlacePrior"),
+    "statements": ("Change", "Pattern", "Place", "PlacedEffects", "Statement", "Verdict", "placed_effects"),
 }
 
 __all__ = [
@@ -115,20 +132,35 @@ __all__ = [
     "PPK_LEAST",
     "QUANTILES",
     "Capability",
+    "Change",
     "Component",
     "Cusum",
     "Distribution",
     "Drift",
     "Ewma",
+    "Form",
     "GaugeStudy",
     "Heterogeneity",
     "Individuals",
+    "LearnedEffect",
+    "LearnedOdds",
     "Method",
     "Movement",
     "Moving",
     "Part",
+    "Pattern",
+    "Place",
+    "PlaceKind",
+    "PlacePrior",
+    "PlacedEffects",
     "RecalibrationInterval",
+    "SeenEffect",
+    "SeenPoses",
+    "SeenUnit",
     "Source",
+    "Statement",
+    "UnitRun",
+    "Verdict",
     "capability_of",
     "change_after",
     "cusum",
@@ -142,10 +174,12 @@ __all__ = [
     "holm",
     "individuals",
     "individuals_run_length",
+    "learned_odds",
     "mean_of",
     "normality_p",
     "one_sided_interval",
     "one_sided_run_length",
+    "placed_effects",
     "ppk_of",
     "recalibration_interval",
     "share_interval",

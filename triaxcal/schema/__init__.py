@@ -14,11 +14,13 @@ from triaxcal.schema.loop import (
     Finding,
     HeldOut,
     Loop,
+    OddsUsed,
     Rezero,
     Trace,
     Unexplained,
 )
 from triaxcal.schema.model import Figure, Model, Residual, Sha256, Text, Uncertainty, Word
+from triaxcal.schema.odds import LearnedEffect, LearnedOdds
 from triaxcal.schema.poses import Poses
 
 __all__ = [
@@ -30,8 +32,11 @@ __all__ = [
     "Figure",
     "Finding",
     "HeldOut",
+    "LearnedEffect",
+    "LearnedOdds",
     "Loop",
     "Model",
+    "OddsUsed",
     "Poses",
     "Residual",
     "Rezero",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from triaxcal.schema.calibration import Calibration, Coefficient, UnitOfCalibration
-from triaxcal.schema.model import Figure, Figures, Model, Residual, Text
+from triaxcal.schema.model import Figure, Figures, Model, Residual, Sha256, Text
 
 Nothing = Annotated[None, Field(description="of 0.1: `null`")]
 """A key that has no meaning since names have probabilities."""
@@ -48,6 +48,16 @@ class Finding(Model):
     apart: Nothing
     residual: Nothing
     pose_residual_g: Nothing
+
+
+class OddsUsed(Model):
+    sha256: Annotated[Sha256, Field(description="SHA-256 of the file")]
+    part_number: Annotated[Text | None, Field(description="part number of the units; `null` is any")]
+    units: Annotated[int, Field(description="number of units that they were learned from")]
+    effects: Annotated[dict[Text, Figure | None], Field(description="odds of effects by name, before any pose")]
+    unmodelled_probability: Annotated[
+        Figure, Field(description="probability of something that no effect describes, before any pose")
+    ]
 
 
 class Candidate(Model):
@@ -159,6 +169,9 @@ class Loop(Model):
         Probabilities, Field(description="of every likely effect, by name; `null`: not calibrated")
     ]
     nothing_probability: Annotated[Figure, Field(description="that nothing acts")]
+    odds: Annotated[
+        OddsUsed | None, Field(description="the learned odds of `--odds`; absent with those of the catalogue")
+    ] = None
     another_unit: Annotated[
         AnotherUnit | None,
         Field(description="another unit or mounting from some pose on; `null` where that is unlikely"),

@@ -14,9 +14,9 @@ from triaxcal.text.cautions import caution
 from triaxcal.text.quality import quality, quality_line
 
 if TYPE_CHECKING:
-    from triaxcal.text import advice, bias_update, diagnosis, pooled_units, traces
+    from triaxcal.text import advice, bias_update, diagnosis, pooled_units, population, traces
 
-_ROOMS = ("advice", "bias_update", "diagnosis", "pooled_units", "traces")
+_ROOMS = ("advice", "bias_update", "diagnosis", "pooled_units", "population", "traces")
 """Chapters that import the diagnosis, which most commands do without."""
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "html",
     "not_evaluated",
     "pooled_units",
+    "population",
     "poses",
     "quality",
     "quality_line",

@@ -18,6 +18,8 @@ from triaxcald.earlier_calibration import ATTACHMENT as EARLIER
 from triaxcald.earlier_calibration import RECORD, EarlierFile
 from triaxcald.errors import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED, DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
+from triaxcald.learned_odds import RECORD as ODDS_RECORD
+from triaxcald.learned_odds import OddsFile
 from triaxcald.outcome import (
     ATTACHMENT,
     CERTIFICATE,
@@ -34,7 +36,7 @@ from triaxcald.provision.registers import image_of
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import RECOVERY_RECORD, SEALED_LATER, STATION_FILE, RawDigest
+from triaxcald.recording.schema import ODDS_FILE, RECOVERY_RECORD, SEALED_LATER, STATION_FILE, RawDigest
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.golden_unit import GoldenCheck
@@ -210,7 +212,16 @@ def _certified(
         computed_with={name: named[name] for name in named if name not in DRAWN_WITH},
         earlier=None if file is None else file.known(),
         at_start=from_attachments(recording.attachments, recording.name),
+        odds=_odds(recording),
     )
+
+
+def _odds(recording: Recording) -> OddsFile | None:
+    """The learned odds by which the unit was diagnosed."""
+    name = recording.metadata.get(ODDS_RECORD, {}).get("file")
+    if (name is None) != (ODDS_FILE not in recording.attachments):
+        raise RecordingError(f"attachment {ODDS_FILE}: without its metadata {ODDS_RECORD}, or the other way round")
+    return None if name is None else OddsFile.parsed(recording.attachments[ODDS_FILE], name)
 
 
 def _earlier(recording: Recording) -> EarlierFile | None:

@@ -36,7 +36,9 @@ from triaxcald.earlier_calibration import EarlierFile
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, read_document, require_unit
+from triaxcald.learned_odds import OddsFile
 from triaxcald.provision.correction import IN_DOCUMENT, to_hex
+from triaxcald.recording.schema import ODDS_FILE
 from triaxcald.verification import unlike
 
 # fit by other ways: a turning unit, poses of known attitude, refinement of
@@ -530,13 +532,14 @@ def diagnose_command(a: argparse.Namespace) -> int:
     measured = as_one_unit(recordings, a)
     check = measured_check(measured, a)
     settings = fit_settings(a, measured)
+    odds = odds_file(a, measured)
     loop = _loop(a, measured, settings, check.poses if check else None)
     remarks, doubts = channels_of_some(recordings), unit_identity_warnings(recordings, loop, settings)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
         doubts += check_identity_warnings(measured, check, loop, settings)
     progress(tc.Stage.ADVICE)
-    document = _loop_document(loop, measured, settings, [*remarks, *doubts], unit_in_doubt=bool(doubts))
+    document = _loop_document(loop, measured, settings, [*remarks, *doubts], unit_in_doubt=bool(doubts), odds=odds)
     if len(names) > 1:
         document = tc.interchange.with_recordings(document, loop, names)
     write_results(a, measured, document)
@@ -573,6 +576,7 @@ def _loop(
             reference=settings.reference,
             check=check,
             at=a.at if a.at is not None else measured.holds_at or tc.Moment.END,
+            odds=None if (file := odds_file(a, measured)) is None else file.prior,
             progress=progress,
         )
 
@@ -584,6 +588,7 @@ def _loop_document(
     remarks: Sequence[str] = (),
     *,
     unit_in_doubt: bool = False,
+    odds: OddsFile | None = None,
 ) -> tc.interchange.Document:
     return documents.loop_document(
         loop,
@@ -593,7 +598,16 @@ def _loop_document(
         stated=settings.stated,
         remarks=remarks,
         unit_in_doubt=unit_in_doubt,
+        odds=None if odds is None else odds.document,
     )
+
+
+def odds_file(a: argparse.Namespace, measured: Measured) -> OddsFile | None:
+    """The learned odds: those of ``--odds``, else those that a `run` had. Raises
+    InputError, InvalidData."""
+    if a.odds:
+        return OddsFile.read(a.odds, measured.part_number)
+    return None if measured.odds is None else OddsFile.parsed(measured.odds, f"{measured.name}: {ODDS_FILE}")
 
 
 def _require_alone(a: argparse.Namespace) -> None:
@@ -616,7 +630,8 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     results = []
     for loop, measured, settings in zip(loops, recordings, settings_of_each, strict=True):
         results.append(
-            _loop_document(loop, measured, settings) | ({"unit": dict(measured.unit)} if measured.unit else {})
+            _loop_document(loop, measured, settings, odds=odds_file(a, measured))
+            | ({"unit": dict(measured.unit)} if measured.unit else {})
         )
     document = tc.interchange.agreement_document(found, names, results, settings_of_each[0].reference_unit)
     if a.output:

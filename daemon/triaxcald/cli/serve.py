@@ -56,6 +56,10 @@ def serve_command(a: argparse.Namespace) -> int:
         from triaxcald.run.golden_unit import golden_calibration
 
         golden_calibration(station)
+    if station.file.odds is not None:
+        from triaxcald.learned_odds import odds_of_station
+
+        odds_of_station(station)
     from triaxcald.signing.station import signing_of
 
     signing_of(station)

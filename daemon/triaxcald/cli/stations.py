@@ -56,6 +56,12 @@ def run_command(a: argparse.Namespace) -> int:
         from triaxcald.earlier_calibration import earlier_by_unit
 
         rezero = earlier_by_unit(a.rezero, station)
+    from triaxcald.learned_odds import OddsFile, odds_of_station
+
+    odds = OddsFile.read(a.odds) if a.odds else odds_of_station(station)
+    if odds is not None:
+        for slot, of_unit in work.items():
+            odds.require_of(of_unit.part_number, f"unit {slot}")
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.unit_run import TrayRun
     from triaxcald.schema.run import Run
@@ -75,7 +81,7 @@ def run_command(a: argparse.Namespace) -> int:
                 events.begun()
 
         tray = TrayRun(
-            station, Several(receivers), force=a.force, rezero=rezero, work=work,
+            station, Several(receivers), force=a.force, rezero=rezero, work=work, odds=odds,
             ended=ended, killed=lambda killed: say(killed.line), begun=begun,
         )  # fmt: skip
         if a.events:

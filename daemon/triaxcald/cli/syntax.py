@@ -312,6 +312,12 @@ def add_command(
     return p
 
 
+def add_odds(p: Any, more: str = "") -> None:
+    p.add_argument(
+        "--odds", metavar="FILE", help=f"odds of each effect, learned from units of the type (`fleet -o`){more}"
+    )
+
+
 def _line(commands: Any) -> None:
     p = add_command(
         commands, "demo", "stations:demo_command", "the whole line on two simulated units, in about a minute",
@@ -337,6 +343,7 @@ def _line(commands: Any) -> None:
         "--rezero", action="append", metavar="CAL",
         help="renew the three biases of this calibration alone, by plan.rezero_poses poses; of several units once each",
     )  # fmt: skip
+    add_odds(p, "; in place of those that the station names")
     _add_work(p)
     add_force(p)
     add_json(p)
@@ -494,6 +501,7 @@ def _on_recordings(commands: Any) -> None:
     )
     p.add_argument("--verbose", action="store_true", help="tables too: errors, probabilities, coefficients, budget")
     add_moment(p)
+    add_odds(p)
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p = add_command(
         commands, "rezero", "fitting:rezero_command", "renew the three biases of a calibration by a few poses",

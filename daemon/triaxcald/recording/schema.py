@@ -40,6 +40,7 @@ BUS_RECORD = "bus"  # the metadata record of a recording of all frames of a bus,
 SEGMENT_RECORD = "segment"  # the metadata record with the place of a segment in its recording
 UNCONFIRMED = "unconfirmed"  # the metadata record, and event, about records of an unknown sender
 STATION_FILE = "station.toml"  # the attachment with the station file
+ODDS_FILE = "odds.json"  # the attachment with learned odds
 PROFILE_FILE = "profile.toml"
 """The attachment with the profile; the files that it names are attachments under
 ``profile/``."""

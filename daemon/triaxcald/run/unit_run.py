@@ -23,6 +23,8 @@ from triaxcald.earlier_calibration import RECORD, EarlierFile
 from triaxcald.errors import DISK, REFUSED, InputError, RecordingError
 from triaxcald.files import in_a_name, unused, write_new, write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
+from triaxcald.learned_odds import RECORD as ODDS_RECORD
+from triaxcald.learned_odds import OddsFile, odds_of_station
 from triaxcald.outcome import (
     ATTACHMENT,
     CERTIFICATE,
@@ -46,7 +48,7 @@ from triaxcald.provision.registers import RegisterImage, leaves_open, require_re
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.manifest import SealedContents, SignatureMade
-from triaxcald.recording.schema import SIGNATURE_FILE
+from triaxcald.recording.schema import ODDS_FILE, SIGNATURE_FILE
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import unit_report
 from triaxcald.run.attempts import AttemptFile, Attempts, Killed, settle_killed
@@ -114,7 +116,8 @@ class UnitRun(UnitSession):
     are renewed. ``work`` is what the unit is measured for, ``attempts`` the tray that
     the run belongs to; by default it is a tray of its own. ``start`` lets all units
     of a tray begin together. ``tray`` is that of units which are turned together.
-    ``id`` is the id of the run.
+    ``odds`` are learned ones, by which the unit is diagnosed. ``id`` is the id of the
+    run.
     """
 
     def __init__(
@@ -132,9 +135,10 @@ class UnitRun(UnitSession):
         attempts: Attempts | None = None,
         start: Start | None = None,
         tray: Tray | None = None,
+        odds: OddsFile | None = None,
     ) -> None:
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
-        self.rezero, self.tray = rezero, tray
+        self.rezero, self.tray, self.odds = rezero, tray, odds if rezero is None else None
         self.others, self.force = others or ActiveUnits(1), force
         self.id = new_run_id(clock_ns())
         self.stopped_for: str | None = None
@@ -188,6 +192,8 @@ class UnitRun(UnitSession):
                 self._golden = await self._golden_check(identity)
                 if self.rezero is not None:
                     self.rezero.require_of_place(self.place, self.station.file.reference, identity.serial)
+                if self.odds is not None:
+                    self.odds.require_of(self._attempt.work.part_number, f"unit {self.name}")
                 self._require_readable_journal(identity)
                 await self._require_readings_before(device)
                 self._at_start = await self.correcting_registers(device)
@@ -198,6 +204,8 @@ class UnitRun(UnitSession):
                     self._recording = path
                     if self.rezero is not None:
                         writer.attach(EARLIER, "application/json", self.rezero.data)
+                    if self.odds is not None and self._golden is None:
+                        writer.attach(ODDS_FILE, "application/json", self.odds.data)
                     if self._golden is not None and self._golden.file is not None:
                         writer.attach(GOLDEN_FILE, "application/json", self._golden.file.data)
                     ending = await self._ending(device, identity, writer)
@@ -306,6 +314,7 @@ class UnitRun(UnitSession):
             RUN_RECORD: {"run": attempt.run, "started": attempt.started},
             WORK_RECORD: attempt.work.record(),
             **self._rezero_record,
+            **({} if self.odds is None or self._golden is not None else {ODDS_RECORD: {"file": self.odds.name}}),
             **({} if self._golden is None else {GOLDEN_RECORD: self._golden.record}),
         }
 
@@ -610,6 +619,7 @@ class UnitRun(UnitSession):
             computed_with=software(),
             earlier=None if self.rezero is None else self.rezero.known(),
             at_start=self._at_start,
+            odds=self.odds,
         )
 
     async def _collect(
@@ -626,7 +636,8 @@ class UnitRun(UnitSession):
         if self._golden is not None:
             plan, targets = plan.model_copy(update={"repeat": False}), check_directions(wanted)
         elif self.rezero is None and calibrating and plan.stop is not None:
-            judge = Judge.of(plan.stop, self.place, self.station.file)
+            odds = None if self.odds is None else self.odds.prior
+            judge = Judge.of(plan.stop, self.place, self.station.file, odds)
             on_demand = OnDemand(judge, repeat=plan.repeat, tell=partial(self._judged, writer))
             targets = on_demand.targets
         elif self.rezero is not None and calibrating:
@@ -738,7 +749,8 @@ class TrayRun:
     tray, ``units`` the handles by slot.
 
     ``rezero`` maps a unit to the calibration whose biases alone are renewed, ``work``
-    maps it to what it is measured for. ``begun`` is called once all attempts are noted
+    maps it to what it is measured for. ``odds`` are learned ones, by default those that
+    the station names. ``begun`` is called once all attempts are noted
     on the disk, or a unit has ended before; ``ended`` then receives each outcome,
     ``killed`` each attempt that a killed process has left in the folder.
     """
@@ -751,6 +763,7 @@ class TrayRun:
         force: str | None = None,
         rezero: Mapping[str, EarlierFile] | None = None,
         work: Mapping[str, Work] | None = None,
+        odds: OddsFile | None = None,
         ended: Callable[[Outcome], None] = lambda _: None,
         killed: Callable[[Killed], None] = lambda _: None,
         begun: Callable[[], None] = lambda: None,
@@ -762,12 +775,13 @@ class TrayRun:
         self._start = Start({place.unit.name for place in station.places}, self._open)
         tray = _tray_of(station)
         self._shown = None if tray is None else TrayProgress(progress, tray)
+        odds = odds_of_station(station) if odds is None else odds
         self._runs = [
             UnitRun(
                 station, place, self._shown or progress,
                 serials=self._serials, force=force, others=self._others,
                 rezero=(rezero or {}).get(place.unit.name), work=(work or {}).get(place.unit.name),
-                attempts=self._attempts, start=self._start, tray=tray,
+                attempts=self._attempts, start=self._start, tray=tray, odds=odds,
             )
             for place in station.places
         ]  # fmt: skip

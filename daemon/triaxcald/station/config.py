@@ -304,6 +304,10 @@ class StationFile(td.Strict):
         Literal["end", "mean"] | Annotated[float, Field(ge=0, allow_inf_nan=False)],
         Field(description="moment of the recording, in s from its start, for which effects of time hold elsewhere"),
     ] = "end"
+    odds: Annotated[
+        PathText | None,
+        Field(description="odds of effects learned from units of the type (`fleet -o`), beside the station file"),
+    ] = None
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()

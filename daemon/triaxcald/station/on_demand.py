@@ -55,10 +55,11 @@ class Judge:
     reference: float = 1.0
     moment: tc.Moment | float = tc.Moment.END
     stated: tc.Stated | None = None
+    odds: tc.evidence.Odds | None = None
 
     @classmethod
-    def of(cls, stop: Stop, place: Place, file: StationFile) -> Judge:
-        return cls(stop, place.signs, file.reference, file.moment, file.stated(place.bundle.profile))
+    def of(cls, stop: Stop, place: Place, file: StationFile, odds: tc.evidence.Odds | None = None) -> Judge:
+        return cls(stop, place.signs, file.reference, file.moment, file.stated(place.bundle.profile), odds)
 
     def predicted_g(self, poses: Sequence[tc.Pose]) -> float | None:
         """Standard uncertainty of the magnitude from the noise inside the poses and
@@ -75,7 +76,9 @@ class Judge:
         """Diagnose the poses: about a second."""
         compute_with_one_thread()
         try:
-            loop = tc.diagnosis.diagnose(poses, signs=self.signs, reference=self.reference, at=self.moment)
+            loop = tc.diagnosis.diagnose(
+                poses, signs=self.signs, reference=self.reference, at=self.moment, odds=self.odds
+            )
         except tc.Refused:
             return NOT_KNOWN
         budget = tc.uncertainty.budget(loop.after, self.stated)

@@ -1,0 +1,945 @@
+"""The search for effects of places: a sum of single effects, each with its posterior
+over forms, figures, places and times."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats, Ints, evenly_spread
+from triaxcal.distributions import chi2_ppf, log_sum_exp
+from triaxcal.effects.catalogue import CATALOGUE
+from triaxcal.effects.odds import EFFECT_ODDS
+from triaxcal.population.figures import TAILS, FigureKind, Standardised, groups_of, standardised
+from triaxcal.population.places import FEWEST, PlacesOfKind, Sums, TimeGrid, places_of
+from triaxcal.population.runs import COEFFICIENTS, UnitRun
+
+
+class Form(StrEnum):
+    """How a place differs."""
+
+    SHIFT = "shift"
+    DRIFT = "drift"
+    """A shift that grows with time."""
+    SCATTER = "scatter"
+    """Units, or runs, scatter more."""
+    FREQUENCY = "frequency"
+    """An effect acts in more units."""
+
+
+@dataclass(frozen=True)
+class PlacePrior:
+    """The settings, each with its reason."""
+
+    odds: float = 0.1
+    """Odds of one more effect of a place: a fleet of a year has one or none."""
+    certain: float = 0.99
+    """Probability from which on an effect, and its place, are named."""
+    reported: float = 0.5
+    """Probability from which on an effect is a candidate."""
+    sizes: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0, 10.0)
+    """Sizes in standard deviations between units: a smaller one does not matter, a
+    larger one is found as well. A factor of 3 changes the evidence little."""
+    factors: tuple[float, ...] = (1.3, 1.7, 2.5, 4.0, 8.0)
+    """Factors of more scatter."""
+    rates: tuple[float, ...] = (0.005, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9)
+    """Shares of units with an effect."""
+    forms: Mapping[Form, float] = field(
+        default_factory=lambda: {Form.SHIFT: 0.55, Form.DRIFT: 0.15, Form.SCATTER: 0.15, Form.FREQUENCY: 0.15}
+    )
+    """Probability of each form: most changes are sudden."""
+    most: int = 10
+    """Maximum number of single effects."""
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Hypotheses of one form and pattern in the places of one kind: ``log`` (n,w) are
+    log evidences against nothing, with priors, by place and window (or ramp);
+    ``log_prior`` (n,w) are the latter.
+
+    Of a shift or drift, ``score`` and ``information`` (n,w,r) are those of its r
+    coefficients, ``vectors`` (r,d) or (N,d) what a unit of each adds to the components
+    of the group. ``scale`` is the size of one coefficient in spreads."""
+
+    form: Form
+    group: int
+    pattern: str
+    places: PlacesOfKind
+    log: Floats
+    log_prior: Floats
+    score: Floats | None = None
+    information: Floats | None = None
+    vectors: Floats | None = None
+    by_run: bool = False
+    scale: float = 1.0
+    levels: Floats | None = None
+    """(n,w,l) of scatter and frequency: log evidence by level."""
+
+    @property
+    def subject(self) -> int | str:
+        """The group of figures, or the effect."""
+        return self.pattern if self.group < 0 else self.group
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Of one single effect."""
+
+    all: Sequence[Family]
+    nothing: float
+    log_total: float
+    grid: TimeGrid
+
+    def families(self) -> Iterator[tuple[Family, Floats]]:
+        """Those that matter, with probabilities (n,w), given that it acts."""
+        acting = log_sum_exp([float(f.log.max(initial=-np.inf)) for f in self.all])
+        of_all = float(log_sum_exp([log_sum_exp(f.log) for f in self.all if np.isfinite(f.log).any()]))
+        for family in self.all:
+            if family.log.max(initial=-np.inf) > acting - NEGLIGIBLE:
+                yield family, np.exp(family.log - of_all)
+
+    def best(self) -> tuple[Family, int, int]:
+        family = max(self.all, key=lambda f: float(f.log.max(initial=-np.inf)))
+        place, window = np.unravel_index(int(np.argmax(family.log)), family.log.shape)
+        return family, int(place), int(window)
+
+    def likely(self) -> Iterator[tuple[Family, int, int, float]]:
+        """Single hypotheses that hold most of it, with their probabilities if it
+        acts."""
+        for family, p in self.families():
+            for place, window in zip(*np.nonzero(p > LEAST_SHARE), strict=True):
+                yield family, int(place), int(window), float(p[place, window])
+
+
+EFFICIENCY = 0.37
+"""Of a median absolute deviation: degrees of freedom of a spread by runs."""
+FOR, TINY = 1.0, 1e-9
+"""Largest log evidence at which a hypothesis is not looked at; and least information
+that is not rounding."""
+NEGLIGIBLE = 12.0
+"""Difference of log probabilities beyond which one does not matter."""
+LEAST_SHARE = 2e-3
+"""Share of a hypothesis that counts in the mean of an effect."""
+NEIGHBOURS = 4
+"""Runs before and after in one place, whose median tells a shifted place from an
+outlier."""
+OUTLYING = 2.5
+"""Spreads from which on this is asked."""
+CAPPED = 3.0
+"""Largest log evidence of one run for more scatter: single outliers are no scatter of
+a place."""
+SCATTERING = 12
+"""Runs that show more scatter: a standard deviation of so many is known to a
+fifth."""
+LARGEST_FACTOR = 30.0
+"""Of scatter: beyond it units are broken."""
+UNKNOWN_LIKELY, UNLISTED = 0.5, 0.05
+"""Probability of an effect that is likely and not calibrated; and likelihood ratio of
+one that a run does not list."""
+SWEEPS, MORE_SWEEPS = 2, 2
+"""Passes over all single effects after a further one, and over them in the end: each
+changes them less."""
+FINER = 10
+"""Moments between which a change point is looked for again."""
+
+
+@dataclass(eq=False)
+class SingleEffect:
+    """What one effect adds to the groups' components (N,d), by group; the scale of
+    scatter by group, of components and of figures; the rate (N,) by effect."""
+
+    posterior: Posterior
+    added: dict[int, Floats]
+    scale: dict[int, tuple[Floats, Floats]]
+    rate: dict[str, Floats]
+    finer: tuple[float, ...] = ()
+    after: tuple[tuple[SingleEffect, ...], tuple[float, ...]] | None = None
+    """The effects, and the moments, that it was last found with."""
+    factor: float = 1.0
+    factor_error: float = 0.0
+    """Of more scatter, under the likeliest hypothesis, with its standard error."""
+
+    def acts_on(self, subject: int | str) -> bool:
+        return subject in self.added or subject in self.scale or subject in self.rate
+
+
+class Search:
+    """Runs by time, their places, and groups of figures in spreads."""
+
+    def __init__(self, runs: Sequence[UnitRun], prior: PlacePrior) -> None:
+        self.runs, self.prior = runs, prior
+        self.time = np.array([run.time_s for run in runs], dtype=float)
+        self.places = places_of(runs)
+        names = sorted({run.part_number or "" for run in runs})
+        self.part = np.array([names.index(run.part_number or "") for run in runs])
+        serials: dict[str, int] = {}
+        self.unit = np.array([serials.setdefault(run.serial, len(serials)) for run in runs])
+        self.count = np.bincount(self.unit)[self.unit]
+        self._raw = groups_of(runs)
+        self._followers, self._same_unit = _followers(runs, self.unit), _pairs(self.unit)
+        self.likelihood = _likelihoods(runs)
+        self.effects: list[SingleEffect] = []
+        self.nothing = 1.0
+        self._standardise({})
+
+    @classmethod
+    def of(cls, runs: Sequence[UnitRun], prior: PlacePrior) -> Search:
+        return cls(runs, prior)
+
+    def _standardise(self, fitted: Mapping[int, Floats]) -> None:
+        self.groups: list[Standardised] = [
+            standardised(g, self.part, self._followers, self._same_unit, fitted.get(i)) for i, g in enumerate(self._raw)
+        ]
+        self.subjects: list[int | str] = [*range(len(self.groups)), *self.likelihood]
+        self.of_residuals = {i for i, g in enumerate(self._raw) if g.kind in (FigureKind.CONVERTER, FigureKind.POSES)}
+        """Groups that are two views of the same residuals."""
+        self._cache: dict[int | str, tuple[tuple[SingleEffect, ...], list[Family]]] = {}
+
+    # The passes.
+
+    def run(self) -> list[SingleEffect]:
+        """The single effects that act more likely than not."""
+        self._grow()
+        if self.effects:
+            # Once more with the spreads of what they leave.
+            self._standardise(self._fitted())
+            self.effects = []
+            self._grow()
+        return self.effects
+
+    def _fitted(self) -> dict[int, Floats]:
+        out = {}
+        for g, group in enumerate(self.groups):
+            z = sum(effect.added.get(g, 0.0) for effect in self.effects)
+            if np.ndim(z):
+                out[g] = (np.asarray(z) @ group.back.T) * group.spread[self.part]
+        return out
+
+    def _grow(self) -> None:
+        for _ in range(self.prior.most):
+            before, found = len(self.effects), self._further()
+            if found is None:
+                break
+            self.effects.append(found)
+            for _ in range(SWEEPS):
+                self._sweep()
+            if len(self.effects) <= before:  # one that others explain
+                break
+        for _ in range(MORE_SWEEPS if len(self.effects) > 1 else 0):
+            self._sweep()
+
+    def _sweep(self) -> None:
+        """Each effect anew, given all others; with finer moments about its change."""
+        for effect in list(self.effects):
+            again = self._again(effect)
+            at = self.effects.index(effect)
+            if again is None:
+                del self.effects[at]
+            else:
+                self.effects[at] = again
+
+    def _finer(self, effect: SingleEffect) -> tuple[float, ...]:
+        """Moments about those of the likeliest window, between runs of its place."""
+        family, place, window = effect.posterior.best()
+        grid = effect.posterior.grid
+        if family.form is Form.DRIFT:
+            return effect.finer
+        times = np.unique(self.time[family.places.inside(place)])
+        bounds = np.concatenate([[-np.inf], grid.edges, [np.inf]])
+        out: list[float] = []
+        for cut in (grid.windows.first[window], grid.windows.end[window]):
+            if 0 < cut < grid.cells:
+                near = times[(times >= bounds[cut - 1]) & (times <= bounds[cut + 1])]
+                # The moment itself stays, with new ones about it.
+                out += [float(bounds[cut]), *evenly_spread((near[1:] + near[:-1]) / 2, FINER)]
+        return tuple(out)
+
+    def _further(self) -> SingleEffect | None:
+        """The posterior of one more effect; None where it is unlikely."""
+        grid = TimeGrid.of(self.time)
+        level = _Level(self, self.effects, grid)
+        families: list[Family] = []
+        for subject in self.subjects:
+            given = tuple(effect for effect in self.effects if effect.acts_on(subject))
+            known = self._cache.get(subject)
+            if known is None or known[0] != given:
+                self._cache[subject] = known = given, list(level.of(subject))
+            families += known[1]
+        return self._effect(level, families, grid, ())
+
+    def _again(self, effect: SingleEffect) -> SingleEffect | None:
+        """The effect, given all others, with finer moments: among what it may be."""
+        finer = self._finer(effect)
+        subjects = self._subjects_of(effect)
+        others = [other for other in self.effects if other is not effect]
+        after = tuple(other for other in others if any(other.acts_on(s) for s in subjects)), finer
+        if effect.after == after:  # nothing has changed for it
+            return effect
+        family, _, window = effect.posterior.best()
+        windows = effect.posterior.grid.windows
+        passing = (
+            family.form is not Form.DRIFT
+            and windows.first[window] > 0
+            and windows.end[window] < effect.posterior.grid.cells
+        )
+        grid = TimeGrid.of(self.time, finer, passing=bool(passing))
+        level = _Level(self, others, grid, effect)
+        found = self._effect(level, [family for subject in subjects for family in level.of(subject)], grid, finer)
+        if found is not None:
+            found.after = after
+        return found
+
+    def _subjects_of(self, effect: SingleEffect) -> list[int | str]:
+        """What it may be of: patterns of residuals compete with each other."""
+        found = {family.subject for family, _ in effect.posterior.families()}
+        if found & self.of_residuals:
+            found |= self.of_residuals
+        return [subject for subject in self.subjects if subject in found]
+
+    def _effect(
+        self, level: _Level, families: Sequence[Family], grid: TimeGrid, finer: tuple[float, ...]
+    ) -> SingleEffect | None:
+        families = [family for family in families if np.isfinite(family.log).any()]
+        if not families:
+            return None
+        log_total = float(log_sum_exp([log_sum_exp(f.log) for f in families]))
+        nothing = float(np.exp(-np.logaddexp(0.0, log_total)))
+        if not finer:
+            self.nothing = nothing
+        if 1 - nothing < self.prior.reported:
+            return None
+        return level.effect(Posterior(families, nothing, log_total, grid), finer)
+
+    # What is read off.
+
+    def time_of(
+        self, posterior: Posterior, best: Family, place: int, fewest: int
+    ) -> tuple[int, float | None, tuple[float, float] | None, float | None]:
+        grid, inside = posterior.grid, best.places.inside(place)
+        if best.form is Form.DRIFT:
+            k = int(np.argmax(best.log[place]))
+            since = grid.ramp_begins(k) if k else None
+            return int(inside.sum()), since, None, None
+        p = np.exp(best.log[place] - log_sum_exp(best.log[place]))
+        window = int(np.argmax(p))
+        first, end = grid.windows.first[window], grid.windows.end[window]
+        cell = grid.cell[inside]
+        acting = (cell >= first) & (cell < end)
+        times = self.time[inside]
+        # Begun before all runs of the place, or ending after them, it is open.
+        since = until = interval = None
+        if (cell < first).any():
+            since = _between(times[cell < first].max(), times[acting].min())
+            begins = np.array([0.0, *grid.edges])[grid.windows.first]
+            order = np.argsort(begins)
+            share = np.cumsum(p[order])
+            low, high = (begins[order][min(int(np.searchsorted(share, q)), len(p) - 1)] for q in (0.025, 0.975))
+            # A change between two runs is no better known than these are apart.
+            interval = (
+                float(min(low if low else since, times[cell < first].max())),
+                float(max(high if high else since, times[acting].min())),
+            )
+        if (cell >= end).any():
+            until = _between(times[acting].max(), times[cell >= end].min())
+        return int(acting.sum()), since, interval, until
+
+    def sizes(self, effect: SingleEffect) -> dict[str, tuple[float, float, str, float]]:
+        """By figure: change, standard uncertainty, unit, change in spreads; under the
+        likeliest pattern and place."""
+        family, place, window = effect.posterior.best()
+        if family.form is Form.SCATTER:
+            return {family.pattern: (effect.factor, effect.factor_error, "1", float("nan"))}
+        if family.score is None or family.information is None or family.vectors is None:
+            assert family.levels is not None
+            rates = np.array(self.prior.rates[1:])
+            log = family.levels[place, window]
+            weight = np.exp(log - log_sum_exp(log))
+            rate = float(weight @ rates)
+            return {family.pattern: (rate, float(np.sqrt(weight @ (rates - rate) ** 2)), "1", float("nan"))}
+        mean, variance = _coefficients(
+            family.score[place, window], family.information[place, window], self.prior.sizes, family.scale
+        )
+        group = self.groups[family.group]
+        if family.by_run:
+            return {family.pattern: (float(mean[0]), float(np.sqrt(variance[0])), UNIT_OF_RUNS[family.pattern],
+                                     float(mean[0] / family.scale))}  # fmt: skip
+        # Components to figures, of the commonest part number.
+        spread = group.spread[int(np.bincount(self.part[family.places.inside(place)]).argmax())]
+        in_spreads = group.back @ (family.vectors.T @ mean)
+        error = np.sqrt((group.back @ family.vectors.T) ** 2 @ variance)
+        out: dict[str, tuple[float, float, str, float]] = {}
+        for k in np.argsort(-np.abs(in_spreads) * (error > ROUNDING * error.max())):
+            if not out or (abs(in_spreads[k]) > SHOWN * error[k] and error[k] > ROUNDING * error.max()):
+                value, sigma = float(in_spreads[k] * spread[k]), float(error[k] * spread[k])
+                unit = group.group.units[k]
+                out[group.group.figures[k]] = (value, sigma, unit, float(in_spreads[k]))
+        return out
+
+
+ROUNDING = 1e-6
+"""Share of the largest uncertainty below which one is rounding."""
+SHOWN = 3.0
+"""Standard uncertainties from which on a figure of several is shown."""
+COMMON_FACTOR, THERMOMETER = "common_factor", "temperature"
+SEVERAL = "several"
+UNIT_OF_RUNS = {COMMON_FACTOR: "", THERMOMETER: "K"}
+
+
+def _between(before: float, after: float) -> float:
+    return float((before + after) / 2)
+
+
+def _followers(runs: Sequence[UnitRun], unit: Ints) -> Ints:
+    """(q,2) runs of different units, one after the other, in one batch, station and
+    fixture."""
+    last: dict[tuple[str | None, ...], int] = {}
+    out = []
+    for i, run in enumerate(runs):
+        key = (run.part_number, run.batch, run.station, run.fixture, run.slot, run.operator)
+        if key in last and unit[last[key]] != unit[i]:
+            out.append((last[key], i))
+        last[key] = i
+    return np.array(out, dtype=np.int64).reshape(-1, 2)
+
+
+LISTED_RUNS = 10
+"""Runs of one unit of which all pairs are listed; of more, a golden unit's say, those
+of neighbours."""
+
+
+def _pairs(unit: Ints) -> Ints:
+    """(r,2) pairs of runs of one unit."""
+    of_unit: dict[int, list[int]] = defaultdict(list)
+    for i, u in enumerate(unit.tolist()):
+        of_unit[u].append(i)
+    out: list[tuple[int, int]] = []
+    for mine in of_unit.values():
+        out += (
+            [(a, b) for k, a in enumerate(mine) for b in mine[k + 1 :]]
+            if len(mine) <= LISTED_RUNS
+            else list(itertools.pairwise(mine))
+        )
+    return np.array(out, dtype=np.int64).reshape(-1, 2)
+
+
+def _likelihoods(runs: Sequence[UnitRun]) -> dict[str, Floats]:
+    """(N,) likelihood ratios of each effect in each run: acting against not."""
+    names = sorted({name for run in runs for name in run.effects})
+    out = {name: np.where([bool(run.effects) for run in runs], UNLISTED, 1.0) for name in names}
+    for i, run in enumerate(runs):
+        for name, seen in run.effects.items():
+            odds = seen.prior_odds if seen.prior_odds > 0 else EFFECT_ODDS / len(CATALOGUE)
+            p = float(np.clip(UNKNOWN_LIKELY if seen.probability is None else seen.probability, 1e-4, 1 - 1e-4))
+            out[name][i] = p / (1 - p) / odds
+    return {name: ratio for name, ratio in out.items() if (ratio > 1).sum() >= FEWEST}
+
+
+def _log_evidence(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> Floats:
+    """(n,w) of r coefficients, normal with one size over √r, mean over the sizes. −∞
+    where the evidence is against an effect: what is left out is a part of the prior
+    odds."""
+    chi2 = np.sum(score**2 / np.maximum(information, TINY), axis=-1)
+    out = np.full(chi2.shape, -np.inf)
+    some = chi2 > 2 * FOR
+    out[some] = _mean_evidence(score[some], information[some], sizes, scale)
+    return out
+
+
+def _mean_evidence(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> Floats:
+    each = []
+    for size in sizes:
+        variance = (size * scale) ** 2 / score.shape[-1]
+        spread = 1 + variance * information
+        each.append(0.5 * np.sum(variance * score**2 / spread - np.log(spread), axis=-1))
+    return np.asarray(log_sum_exp(np.array(each), axis=0) - np.log(len(sizes)))
+
+
+def _with_spread_estimated(families: Sequence[Family], dof: float) -> Iterator[Family]:
+    """Families whose evidences (without priors) suppose the spread between units
+    known, with priors and for a spread that is known with ``dof`` degrees of freedom:
+    Student's t of what the best hypothesis explains and another does not."""
+    best = max((float(f.log.max(initial=0.0, where=np.isfinite(f.log_prior))) for f in families), default=0.0)
+    nothing = -0.5 * dof * np.log1p(2 * best / dof)
+    for family in families:
+        short = np.maximum(best - family.log, 0.0)
+        with np.errstate(invalid="ignore"):
+            log = np.where(np.isfinite(family.log), -0.5 * dof * np.log1p(2 * short / dof) - nothing, -np.inf)
+        yield replace(family, log=log + family.log_prior)
+
+
+def _mean_of_levels(levels: Floats) -> Floats:
+    """(n,w) log mean over levels (n,w,l); −∞ where none is for the effect."""
+    out = np.full(levels.shape[:-1], -np.inf)
+    some = levels.max(axis=-1) > FOR
+    out[some] = log_sum_exp(levels[some], axis=-1) - np.log(levels.shape[-1])
+    return out
+
+
+def _coefficients(score: Floats, information: Floats, sizes: Sequence[float], scale: float) -> tuple[Floats, Floats]:
+    """(r,) means and variances of the coefficients of one hypothesis."""
+    r = len(score)
+    variance = (np.array(sizes)[:, None] * scale) ** 2 / r
+    spread = 1 + variance * information
+    log = 0.5 * np.sum(variance * score**2 / spread - np.log(spread), axis=1)
+    weight = np.exp(log - log_sum_exp(log))
+    mean = variance * score / spread
+    average = weight @ mean
+    return average, weight @ (variance / spread + (mean - average) ** 2)
+
+
+def _in_robust_spreads(values: Floats) -> Floats:
+    """About medians, over 1.4826 times the median absolute deviations."""
+    some = np.isfinite(values).any(axis=0)
+    filled = np.where(some, values, 0.0)
+    left = filled - np.nanmedian(filled, axis=0)
+    spread = 1.4826 * np.nanmedian(np.abs(left), axis=0)
+    return np.where(some, left / np.where(spread > 0, spread, 1.0), np.nan)
+
+
+def _log_t_ratio(square: Floats, known: Bools, factors: Floats, d: Floats | float = 1.0) -> Floats:
+    """(N,l) log of Student's t with d dimensions scaled by a factor over that without,
+    at these squares (N,); a single run decides little."""
+    d = np.broadcast_to(np.asarray(d, dtype=float), square.shape)[:, None]
+    square = np.nan_to_num(square)[:, None]
+    ratio = np.log1p(square / TAILS) - np.log1p(square / (TAILS * factors**2))
+    return np.where(known[:, None], np.minimum(0.5 * (TAILS + d) * ratio - d * np.log(factors), CAPPED), 0.0)
+
+
+def _t_weight(r: Floats) -> Floats:
+    return (TAILS + 1) / (TAILS + r**2)
+
+
+class _Level:
+    """All hypotheses of one more effect, given others."""
+
+    def __init__(
+        self, search: Search, given: Sequence[SingleEffect], grid: TimeGrid, own: SingleEffect | None = None
+    ) -> None:
+        """``own`` is the effect as it was before, if it is looked at again: a run is an
+        outlier by what all effects leave."""
+        self.search, self.given, self.grid, self.own = search, given, grid, own
+        self.sums = [Sums(places, grid) for places in search.places]
+        self.share_of_kinds = -np.log(max(len(self.sums), 1))
+
+    def _allowed(self, sums: Sums, known: Bools) -> Floats:
+        """(n,w) log priors of places and windows, −∞ where too few runs are in it, or
+        outside, of which the figure is ``known`` (N,)."""
+        known = np.asarray(known, dtype=float)
+        count = known / self.search.count
+        inside = sums.by_window(sums.by_cell(np.stack([known, count], axis=1)))
+        total = np.array([known.sum(), count.sum()])
+        enough = (inside[..., 0] >= FEWEST) & (inside[..., 1] >= UNITS)
+        enough &= (total[0] - inside[..., 0] >= FEWEST) & (total[1] - inside[..., 1] >= UNITS)
+        prior = self.grid.windows.log_prior - np.log(len(sums.places.names))
+        return np.where(enough, prior, -np.inf)
+
+    # The data of one group, given the other effects.
+
+    def residual(self, g: int) -> tuple[Floats, Floats]:
+        """(N,d) of the components, and their precisions."""
+        group, left = self.search.groups[g], self._left(g)
+        scale = np.ones_like(left)
+        for effect in self.given:
+            if g in effect.scale:
+                scale = scale * effect.scale[g][0]
+        weight = group.weight / scale**2
+        rest = left if self.own is None else left - self.own.added.get(g, 0.0)
+        r = self._centred(rest, weight) * np.sqrt(weight)
+        robust = _t_weight(r)
+        far = (np.abs(r) > OUTLYING) & (weight > 0)
+        if far.any():
+            robust[far] = np.maximum(robust[far], _t_weight(self._from_neighbours(r, weight > 0, far)))
+        # The variance of the score is the information.
+        used = weight > 0
+        square = np.sum(np.where(used, robust**2 * np.minimum(r, 4.0).clip(-4.0) ** 2, 0.0), axis=0)
+        calibrated = np.sum(np.where(used, robust, 0.0), axis=0) / np.maximum(square, 1e-12)
+        weight = weight * robust * np.clip(calibrated, 0.3, 1.2)
+        return self._centred(left, weight), weight
+
+    def _left(self, g: int) -> Floats:
+        """(N,d) of the components what the other effects leave."""
+        added = (effect.added[g] for effect in self.given if g in effect.added)
+        return np.asarray(self.search.groups[g].z - sum(added, np.zeros(1)))
+
+    def _centred(self, left: Floats, weight: Floats) -> Floats:
+        out = left.copy()
+        for t in range(int(self.search.part.max()) + 1):
+            mine = self.search.part == t
+            total = weight[mine].sum(axis=0)
+            out[mine] -= np.sum(weight[mine] * left[mine], axis=0) / np.where(total > 0, total, 1.0)
+        return out
+
+    def _from_neighbours(self, r: Floats, known: Bools, far: Bools) -> Floats:
+        """Smallest distance of each ``far`` value from the median of its neighbours in
+        time, over the kinds of places."""
+        row, column = np.nonzero(far)
+        smallest = np.abs(r[far])
+        for places in self.search.places:
+            order = np.argsort(places.label, kind="stable")
+            rank = np.empty(len(order), dtype=np.int64)
+            rank[order] = np.arange(len(order))
+            offset = np.array([k for k in range(-NEIGHBOURS, NEIGHBOURS + 1) if k])
+            beside = np.clip(rank[row][:, None] + offset, 0, len(order) - 1)
+            neighbour = order[beside]
+            same = (places.label[neighbour] == places.label[row][:, None]) & (places.label[row] >= 0)[:, None]
+            same &= known[neighbour, column[:, None]] & (neighbour != row[:, None])
+            enough = same.sum(axis=1) >= NEIGHBOURS
+            if enough.any():
+                values = np.where(same, r[neighbour, column[:, None]], np.nan)[enough]
+                smallest[enough] = np.minimum(smallest[enough], np.abs(r[far][enough] - np.nanmedian(values, axis=1)))
+        return smallest
+
+    # All hypotheses.
+
+    def of(self, subject: int | str) -> Iterator[Family]:
+        """The hypotheses of a group of figures, or of the frequency of an effect."""
+        prior = self.search.prior
+        start = np.log(prior.odds) + self.share_of_kinds
+        if isinstance(subject, str):
+            start += np.log(prior.forms[Form.FREQUENCY]) - np.log(len(self.search.likelihood))
+            yield from self._frequency(subject, start)
+            return
+        start -= np.log(len(self.search.groups))
+        left, weight = self.residual(subject)
+        families = [
+            *self._means(subject, left, weight, start),
+            *self._scatter(subject, self._left(subject), start + np.log(prior.forms[Form.SCATTER])),
+        ]
+        known = (self.search.groups[subject].weight > 0).any(axis=1).sum()
+        yield from _with_spread_estimated(families, EFFICIENCY * float(known))
+
+    def _means(self, g: int, left: Floats, weight: Floats, start: float) -> Iterator[Family]:
+        search, group = self.search, self.search.groups[g]
+        precise = _Precision(search.unit, search.count, group.repeatability, weight)
+        pull, ones = precise.times(left), precise.times(np.ones_like(left))
+        pull = pull - ones * self._mean_by_part(pull, ones)
+        patterns = list(_patterns(group, search.runs, search.part))
+        known = np.asarray((group.weight > 0).any(axis=1))
+        pairs, between = search._same_unit, precise.between(search._same_unit)
+        for sums in self.sums:
+            allowed = self._allowed(sums, known)
+            score = sums.by_cell(pull)
+            information, taken = sums.by_cell(precise.diagonal), self._by_part(sums, ones, ones)
+            for form in (Form.SHIFT, Form.DRIFT):
+                if form is Form.SHIFT:
+                    s, h = sums.by_window(score), sums.by_window(information)
+                    h = h + sums.pairs_by_window(pairs, between)
+                    h = h - sum(sums.by_window(part) ** 2 / total for part, total in taken)
+                    base = allowed
+                else:
+                    s, h = sums.by_ramp(score), sums.by_ramp(information, 2)
+                    h = h + sums.pairs_by_ramp(pairs, between)
+                    h = h - sum(sums.by_ramp(part) ** 2 / total for part, total in taken)
+                    everything = allowed.max(axis=1)
+                    base = (
+                        self.grid.ramps[1]
+                        - np.log(len(everything))
+                        + np.where(np.isfinite(everything), 0, -np.inf)[:, None]
+                    )
+                h = np.maximum(h, 0.0)
+                prior = base + start + np.log(search.prior.forms[form]) - np.log(len(patterns))
+                for name, vectors, by_run, scale in patterns:
+                    if by_run:
+                        if form is Form.DRIFT:
+                            continue
+                        own_s, own_h = self._by_run(sums, precise, pull, ones, vectors)
+                    elif len(vectors) == 1:
+                        own_s, own_h = s @ vectors.T, h @ vectors.T**2
+                    else:
+                        index = np.flatnonzero(vectors.any(axis=0))
+                        own_s, own_h = s[..., index], h[..., index]
+                    log = _log_evidence(own_s, own_h, search.prior.sizes, scale)
+                    yield Family(form, g, name, sums.places, log, prior, own_s, own_h, vectors, by_run, scale)
+
+    def _mean_by_part(self, pull: Floats, ones: Floats) -> Floats:
+        out = np.zeros_like(pull)
+        for t in range(int(self.search.part.max()) + 1):
+            mine = self.search.part == t
+            total = ones[mine].sum(axis=0)
+            out[mine] = pull[mine].sum(axis=0) / np.where(total > 0, total, 1.0)
+        return out
+
+    def _by_part(self, sums: Sums, values: Floats, ones: Floats) -> list[tuple[Floats, Floats]]:
+        """By part number: sums of ``values`` by cell, and the total precision of the
+        mean, which is free."""
+        out = []
+        for t in range(int(self.search.part.max()) + 1):
+            mine = (self.search.part == t)[:, None]
+            total = np.sum(ones * mine, axis=0)
+            out.append((sums.by_cell(values * mine), np.where(total > 0, total, 1.0)))
+        return out
+
+    def _by_run(
+        self, sums: Sums, precise: _Precision, pull: Floats, ones: Floats, vectors: Floats
+    ) -> tuple[Floats, Floats]:
+        """Score and information (n,w,1) of a coefficient with ``vectors`` (N,d) of
+        its own for each run."""
+        score = sums.by_window(sums.by_cell(np.sum(pull * vectors, axis=1, keepdims=True)))
+        own = np.sum(precise.diagonal * vectors**2, axis=1, keepdims=True)
+        information = sums.by_window(sums.by_cell(own))
+        pairs = self.search._same_unit
+        product = vectors[pairs[:, 0]] * vectors[pairs[:, 1]]
+        between = np.sum(precise.between(pairs) * product, axis=1, keepdims=True)
+        information = information + sums.pairs_by_window(pairs, between)
+        for part, total in self._by_part(sums, ones * vectors, ones):
+            information = information - np.sum(sums.by_window(part) ** 2 / total, axis=-1, keepdims=True)
+        return score, np.maximum(information, 0.0)
+
+    def _scatter(self, g: int, left: Floats, start: float) -> Iterator[Family]:
+        search, group = self.search, self.search.groups[g]
+        factors = np.array(search.prior.factors)
+        alone = group.group.figures if group.group.alone else ()
+        prior = start - np.log(max(len(alone) + (len(group.mix) > 1), 1))
+        of = dict(self._scatter_of_each(g, left, factors))
+        known = np.asarray((group.weight > 0).any(axis=1))
+        for sums in self.sums:
+            allowed = self._allowed(sums, known)
+            runs = sums.by_window(sums.by_cell(known[:, None].astype(float)))[..., 0]
+            base = np.where(runs >= SCATTERING, allowed + prior, -np.inf)
+            for name, gain in of.items():
+                levels = sums.by_window(sums.by_cell(gain))
+                log = _mean_of_levels(levels)
+                yield Family(Form.SCATTER, g, name, sums.places, log, base, levels=levels)
+
+    def _scatter_of_each(self, g: int, left: Floats, factors: Floats) -> Iterator[tuple[str, Floats]]:
+        """(N,l) log density of each run with each factor against without, of each
+        figure, and of all together."""
+        group = self.search.groups[g]
+        figures, components = self.deviations(g, left)
+        if group.group.alone:
+            for k, name in enumerate(group.group.figures):
+                yield name, _log_t_ratio(figures[:, k] ** 2, np.isfinite(figures[:, k]), factors)
+        if components.shape[1] > 1:
+            d = np.isfinite(components).sum(axis=1)
+            square = np.nansum(components**2, axis=1)
+            # Components that are not independent count as fewer.
+            known = d == d.max()
+            middle, spread = (
+                np.median(square[known]),
+                1.4826 * np.median(np.abs(square[known] - np.median(square[known]))),
+            )
+            independent = float(np.clip(2 * middle**2 / max(spread**2, 1e-12), 1.0, d.max()))
+            share = independent / d.max()
+            square = square / max(middle, 1e-12) * float(chi2_ppf(0.5, independent))
+            yield SEVERAL, _log_t_ratio(square, d > 0, factors, d * share)
+
+    def deviations(self, g: int, left: Floats) -> tuple[Floats, Floats]:
+        """Figures (N,f) and components (N,d) about their medians, in robust standard
+        deviations, without the scatter of the other effects; NaN where a run has
+        none."""
+        group = self.search.groups[g]
+        known = group.weight > 0
+        components = np.where(known, left * np.sqrt(np.where(known, group.weight, 1.0)), np.nan)
+        figures = (
+            np.where(known.all(axis=1, keepdims=True), left @ group.back.T, np.nan)
+            if group.group.whitened
+            else components
+        )
+        for effect in self.given:
+            if g in effect.scale:
+                components, figures = components / effect.scale[g][0], figures / effect.scale[g][1]
+        return _in_robust_spreads(figures), _in_robust_spreads(components)
+
+    def _frequency(self, name: str, start: float) -> Iterator[Family]:
+        """A share of units in the place, and a smaller one elsewhere, against one for
+        all; each of the shares is as probable."""
+        ratio, rates = self.search.likelihood[name][:, None], np.array(self.search.prior.rates)
+        own = np.zeros((len(ratio), 1))
+        for effect in self.given:
+            if name in effect.rate:
+                own = np.maximum(own, effect.rate[name][:, None])
+        # Runs that another effect claims keep at least its share.
+        within = np.log1p(np.maximum(rates, own) * (ratio - 1))
+        elsewhere = np.log1p(np.where(own > 0, own, rates) * (ratio - 1))
+        every = elsewhere.sum(axis=0)
+        alike = log_sum_exp(every) - np.log(len(rates))
+        pairs = len(rates) * (len(rates) - 1) / 2
+        known = np.array([bool(run.effects) for run in self.search.runs], dtype=bool)
+        for sums in self.sums:
+            inside = sums.by_window(sums.by_cell(within))
+            outside = every - sums.by_window(sums.by_cell(elsewhere))
+            smaller = np.logaddexp.accumulate(outside, axis=2)[..., :-1]
+            levels = inside[..., 1:] + smaller - np.log(pairs / (len(rates) - 1)) - alike
+            prior = self._allowed(sums, known) + start
+            yield Family(Form.FREQUENCY, -1, name, sums.places, prior + _mean_of_levels(levels), prior, levels=levels)
+
+    # The effect from its posterior.
+
+    def effect(self, posterior: Posterior, finer: tuple[float, ...]) -> SingleEffect:
+        search, acts = self.search, 1 - posterior.nothing
+        n = len(search.runs)
+        added: dict[int, Floats] = {}
+        log_scale: dict[int, tuple[Floats, Floats]] = {}
+        rate: dict[str, Floats] = {}
+        for family, place, window, p in posterior.likely():
+            share = self._in_time(family, place, window) * (p * acts)
+            if family.form in (Form.SHIFT, Form.DRIFT):
+                assert family.score is not None
+                assert family.information is not None
+                assert family.vectors is not None
+                mean, _ = _coefficients(
+                    family.score[place, window], family.information[place, window], search.prior.sizes, family.scale
+                )
+                group = search.groups[family.group]
+                to = added.setdefault(family.group, np.zeros((n, len(group.mix))))
+                to += share[:, None] * (family.vectors * mean if family.by_run else mean @ family.vectors)
+                continue
+            assert family.levels is not None
+            weight = np.exp(family.levels[place, window] - log_sum_exp(family.levels[place, window]))
+            if family.form is Form.FREQUENCY:
+                own = rate.setdefault(family.pattern, np.zeros(n))
+                own += share * float(weight @ np.array(search.prior.rates[1:]))
+                continue
+            group = search.groups[family.group]
+            factor = self.factor(family, place, window)
+            of_components, of_figures = np.full(len(group.mix), factor), np.full(len(group.back), factor)
+            if family.pattern != SEVERAL:
+                k = group.group.figures.index(family.pattern)
+                of_components = np.sqrt(1 + (factor**2 - 1) * group.mix[:, k] ** 2)
+                of_figures = np.where(np.arange(len(group.back)) == k, factor, 1.0)
+            sizes = log_scale.setdefault(family.group, (np.zeros((n, len(group.mix))), np.zeros((n, len(group.back)))))
+            sizes[0][:] += share[:, None] * np.log(of_components)
+            sizes[1][:] += share[:, None] * np.log(of_figures)
+        self._take_all_residuals(posterior, added, acts)
+        scale = {g: (np.exp(a), np.exp(b)) for g, (a, b) in log_scale.items()}
+        best, place, window = posterior.best()
+        if best.form is not Form.SCATTER:
+            return SingleEffect(posterior, added, scale, rate, finer)
+        factor = self.factor(best, place, window)
+        # The median of squares is known to 1.17 / √n of it, its root to half of that.
+        error = factor * 1.17 / np.sqrt(max(float(self._in_time(best, place, window).sum()), 1.0))
+        return SingleEffect(posterior, added, scale, rate, finer, factor=factor, factor_error=float(error))
+
+    def _take_all_residuals(self, posterior: Posterior, added: dict[int, Floats], acts: float) -> None:
+        """A pattern of residuals at a place is one effect, whatever else it looks like:
+        all that the residuals do in that place and time is taken off with it."""
+        search = self.search
+        inside = np.zeros(len(search.runs))
+        for family, place, window, p in posterior.likely():
+            if family.group in search.of_residuals and family.form in (Form.SHIFT, Form.DRIFT):
+                inside += self._in_time(family, place, window) * p * acts
+        if not inside.any():
+            return
+        for g in search.of_residuals:
+            left, weight = self._left(g), search.groups[g].weight
+            # Least squares on the place, with a free mean, without outliers.
+            for _ in range(3):
+                total = np.maximum(weight.sum(axis=0), TINY)
+                about = inside[:, None] - (weight * inside[:, None]).sum(axis=0) / total
+                centred = left - (weight * left).sum(axis=0) / total
+                shift = (weight * about * centred).sum(axis=0) / np.maximum((weight * about**2).sum(axis=0), TINY)
+                weight = search.groups[g].weight * _t_weight(centred - about * shift)
+            added[g] = inside[:, None] * shift
+
+    def factor(self, family: Family, place: int, window: int) -> float:
+        """The factor of more scatter: the median of the squares inside over that
+        outside."""
+        figures, components = self.deviations(family.group, self._left(family.group))
+        group = self.search.groups[family.group]
+        if family.pattern == SEVERAL:
+            square = np.nansum(components**2, axis=1)
+        else:
+            square = figures[:, group.group.figures.index(family.pattern)] ** 2
+        inside = self._in_time(family, place, window) > 0
+        known = np.isfinite(square)
+        ratio = np.median(square[inside & known]) / max(np.median(square[~inside & known]), 1e-12)
+        return float(np.clip(np.sqrt(ratio), 1.0, LARGEST_FACTOR))
+
+    def _in_time(self, family: Family, place: int, window: int) -> Floats:
+        """(N,) 1 in the place and window, the ramp of a drift, else 0."""
+        inside = family.places.inside(place).astype(float)
+        if family.form is Form.DRIFT:
+            return np.asarray(inside * self.grid.ramps[0][window][self.grid.cell])
+        first, end = self.grid.windows.first[window], self.grid.windows.end[window]
+        return np.asarray(inside * ((self.grid.cell >= first) & (self.grid.cell < end)))
+
+
+UNITS = 3.0
+"""Different units in a place and time, and outside; a unit that is measured m times
+counts as one m-th."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Precision:
+    """Runs of one unit share what is the unit's: with the share λ of ``repeatability``
+    (d,) their covariance is W^−½ ((1 − λ) 1 1ᵀ + λ I) W^−½, with ``weight`` W (N,d)."""
+
+    unit: Ints
+    count: Ints
+    repeatability: Floats
+    weight: Floats
+
+    @cached_property
+    def _common(self) -> Floats:
+        """(N,d) the κ of the inverse (I − κ 1 1ᵀ) / λ."""
+        m = self.count[:, None]
+        return (1 - self.repeatability) / (self.repeatability + m * (1 - self.repeatability))
+
+    def times(self, values: Floats) -> Floats:
+        root = np.sqrt(self.weight)
+        scaled = root * values
+        if (self.count == 1).all():
+            return root * scaled
+        total = np.zeros((int(self.unit.max()) + 1, values.shape[1]))
+        np.add.at(total, self.unit, scaled)
+        return np.asarray(root * (scaled - self._common * total[self.unit]) / self.repeatability)
+
+    @cached_property
+    def diagonal(self) -> Floats:
+        if (self.count == 1).all():
+            return self.weight
+        return np.asarray(self.weight * (1 - self._common) / self.repeatability)
+
+    def between(self, pairs: Ints) -> Floats:
+        """(p,d) twice the element of each of the ``pairs`` (p,2) of runs of one
+        unit."""
+        first, second = pairs.T
+        m = self.count[first]
+        # Of many runs only neighbours are listed: each stands for all of its pairs.
+        stands_for = np.where(m <= LISTED_RUNS, 1.0, m / 2)[:, None]
+        root = np.sqrt(self.weight[first] * self.weight[second])
+        return np.asarray(-2 * root * self._common[first] / self.repeatability * stands_for)
+
+
+def _patterns(group: Standardised, runs: Sequence[UnitRun], part: Ints) -> Iterator[tuple[str, Floats, bool, float]]:
+    """Name, vectors, whether these are by run, and the size of a coefficient that
+    makes one spread."""
+    d = len(group.mix)
+    if group.group.alone:
+        for k, name in enumerate(group.group.figures):
+            yield name, group.mix[:, k][None], False, 1.0
+    if group.group.kind is FigureKind.CONVERTER:
+        for k in range(0, d, 2):  # sine and cosine of one period
+            vectors = np.zeros((2, d))
+            vectors[0, k] = vectors[1, k + 1] = 1.0
+            yield group.group.figures[k].removesuffix(" sine"), vectors, False, 1.0
+    elif d > 1:
+        yield SEVERAL, np.eye(d), False, 1.0
+    if group.group.kind is FigureKind.COEFFICIENTS:
+        factor = np.zeros((len(runs), len(COEFFICIENTS)))
+        factor[:, :3] = 1.0
+        for name, shifts in ((COMMON_FACTOR, factor), (THERMOMETER, _by_temperature(runs))):
+            vectors = (shifts / group.spread[part]) @ group.mix.T
+            typical = float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+            if typical > 0:
+                yield name, vectors, True, 1 / typical
+
+
+def _by_temperature(runs: Sequence[UnitRun]) -> Floats:
+    """(N,9) what a thermometer that reads 1 K too high does to the coefficients at the
+    reference temperature: minus each unit's coefficients of temperature."""
+    out = np.zeros((len(runs), len(COEFFICIENTS)))
+    for i, run in enumerate(runs):
+        for name, first in (("temperature_scale_factor", 0), ("temperature_bias", 6)):
+            seen = run.effects.get(name)
+            for k, axis in enumerate("xyz"):
+                if seen is not None and axis in seen.coefficients:
+                    out[i, first + k] = -seen.coefficients[axis][0]
+    return out
