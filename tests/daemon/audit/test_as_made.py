@@ -26,6 +26,7 @@ from triaxcald.audit.wheels import Wheels
 from triaxcald.cli.commands import main
 from triaxcald.errors import RecordingError
 from triaxcald.many import Unusable
+from triaxcald.software import drawn_with, versions
 
 VERSIONS = {"triaxcal": "0.1.9", "numpy": "1.26.0", "scipy": "1.11.0", "matplotlib": "3.8.0", "jinja2": "3.1.0"}
 PROGRAM = """
@@ -333,30 +334,30 @@ def offline() -> list[str]:
 
 @pytest.mark.slow
 def test_a_recording_comes_out_the_same_under_its_versions_without_a_network(
-    finished_run: Any, tmp_path: Path, offline: list[str]
+    tmp_path: Path, offline: list[str]
 ) -> None:
-    """Wheels of this source, and of all that it needs as it is installed here."""
+    """Wheels of this source, and of all that it needs as it is installed here. A report may be drawn otherwise in the
+    next commit of the same development version."""
     folder = tmp_path / "wheels"
     folder.mkdir()
     of_source(folder)
     for name in needs_of("triaxcal"):
         repacked(folder, name)
-    forged = Forgery.of(finished_run.can)
-    forged.edit("certificate.json", lambda c: c["result"]["calibration"]["bias"].reverse())
-    forged.seal()
-    differs = forged.write(tmp_path / "forged.mcap")
-    environment = {**os.environ, **UNREACHABLE, "XDG_CACHE_HOME": str(tmp_path / "cache"), "PIP_NO_INDEX": "1"}
-
-    def audited(*paths: Path) -> tuple[int, list[Any], str]:
-        command = [*offline, sys.executable, "-m", "triaxcald.cli", "audit", "--json", "--as-made", "--wheels", folder]
-        done = subprocess.run([*command, *paths], env=environment, capture_output=True, text=True, check=False)
-        return done.returncode, json.loads(done.stdout)["audits"] if done.stdout else [], done.stderr
-
-    code, audits, told = audited(finished_run.can)
-    assert (code, [audit["result"] for audit in audits]) == (0, ["same_bytes"]), (audits, told)
+    here = {**versions(), **drawn_with()}
+    same = made_with(tmp_path / "same.mcap", here)
+    differs = made_with(
+        tmp_path / "forged.mcap", here, {"certificate.json": lambda c: c["result"]["calibration"]["bias"].reverse()}
+    )
+    environment = {**os.environ, **UNREACHABLE, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    command = [*offline, sys.executable, "-m", "triaxcald.cli", "audit", "--json", "--as-made", "--wheels", folder]
+    done = subprocess.run([*command, same, differs], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr
+    audits = json.loads(done.stdout)["audits"]
+    found = [{line.partition(":")[0] for line in audit["differences"]} for audit in audits]
+    assert found[0] <= {"report.html"}
+    assert "certificate.json" in found[1]
+    assert all({"certificate.json", "verification.json"} <= set(audit["checked"]) for audit in audits)
     (inner,) = (tmp_path / "cache" / "triaxcal" / "as-made").iterdir()
     where = "import triaxcald; print(triaxcald.__file__)"
-    found = subprocess.run([inner / "bin/python", "-I", "-c", where], capture_output=True, text=True, check=True)
-    assert Path(found.stdout.strip()).is_relative_to(inner)
-    code, audits, told = audited(finished_run.can, differs)
-    assert (code, [audit["result"] for audit in audits]) == (1, ["same_bytes", "differs"]), (audits, told)
+    said = subprocess.run([inner / "bin/python", "-I", "-c", where], capture_output=True, text=True, check=True)
+    assert Path(said.stdout.strip()).is_relative_to(inner)
