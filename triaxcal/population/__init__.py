@@ -51,6 +51,7 @@ if TYPE_CHECKING:
         drift_of,
         recalibration_interval,
     )
+    from triaxcal.population.figures import LEAST_RUNS
     from triaxcal.population.gauge import (
         Component,
         GaugeStudy,
@@ -114,6 +115,7 @@ _NAMES = {
         "drift_of",
         "recalibration_interval",
     ),
+    "figures": ("LEAST_RUNS",),
     "gauge": (
         "Component",
         "GaugeStudy",
@@ -128,6 +130,7 @@ _NAMES = {
 }
 
 __all__ = [
+    "LEAST_RUNS",
     "LEVEL",
     "PPK_LEAST",
     "QUANTILES",

@@ -63,8 +63,12 @@ def line(found: Statement, day: Callable[[float], str]) -> str:
     certain = "" if found.verdict is not Verdict.CANDIDATE else f" (probability {chance(found.probability)})"
     when = f" since {day(found.since_s)}" if found.since_s is not None else ""
     when += f" until {day(found.until_s)}" if found.until_s is not None else ""
-    sizes = "; ".join(_size(name, change) for name, change in [*found.sizes.items()][:SHOWN])
-    return f"{where}{when}: {pattern(found.pattern)}{certain}; {sizes}; {found.runs} runs"
+    return f"{where}{when}: {pattern(found.pattern)}{certain}; {sizes(found)}; {found.runs} runs"
+
+
+def sizes(found: Statement) -> str:
+    """The largest changes."""
+    return "; ".join(_size(name, change) for name, change in [*found.sizes.items()][:SHOWN])
 
 
 def lines(found: PlacedEffects, day: Callable[[float], str]) -> list[str]:

@@ -11,6 +11,7 @@ import triaxcal as tc
 from triaxcald.cli.console import at, emit, erased, say, show, table
 from triaxcald.cli.results import period_us, require_kind, write_table
 from triaxcald.cli.syntax import writable
+from triaxcald.documents import to_text
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.fleet.reading import WORK
@@ -25,10 +26,12 @@ SHOWN_MOST = 40
 
 def fleet_command(a: argparse.Namespace) -> int:
     from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
+    from triaxcald.fleet.places import learned, placed
     from triaxcald.schema.fleet import FleetDocument
 
     require_kind(a.table)
     writable(a.report)
+    writable(a.output)
     since_us, until_us = period_us(a.since, a.until)
     equal = {name: getattr(a, name) for name in WORK if getattr(a, name) is not None}
     told = {f"--{name.replace('_', '-')}": text for name, text in equal.items()}
@@ -37,12 +40,17 @@ def fleet_command(a: argparse.Namespace) -> int:
     fleets = fleets_of(runs)
     at("statistics")
     asked = Asked(a.limit, a.probability, told)
-    made = fleet_document(fleets, _shown(a.source), runs.skipped, asked)
+    made = fleet_document(
+        fleets, _shown(a.source), runs.skipped, asked, lambda fleet: placed(fleet, runs.folder, _reading)
+    )
+    odds = None if a.output is None else learned(fleets, _shown(a.source), runs.folder, _reading)
     document = FleetDocument.model_validate(made).document()
     if a.report is not None:
         from triaxcald.fleet import render_fleet
 
         write_text(a.report, render_fleet(document, fleets, lambda done, of: at("pictures", done / of)))
+    if odds is not None:
+        write_text(a.output, to_text(odds))
     if a.table is not None:
         write_table(a.table, COLUMNS, table_rows(fleets))
     erased()

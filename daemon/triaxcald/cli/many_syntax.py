@@ -166,6 +166,10 @@ def _fleet(commands: Any) -> None:
         "--probability", type=_share, default=0.05, metavar="P",
         help="that the error is beyond the limit then; default 0.05",
     )  # fmt: skip
+    p.add_argument(
+        "-o", "--output", type=Path, metavar="ODDS.json",
+        help="odds of each effect for the next unit of one part number, as --odds of run and diagnose takes them",
+    )  # fmt: skip
     p.add_argument("--report", type=Path, metavar="PAGE.html", help="the page, in one file")
     p.add_argument("--table", type=Path, metavar="TABLE", help="a row a unit and figure: .csv, .csv.gz or .parquet")
     add_json(p)

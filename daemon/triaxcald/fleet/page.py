@@ -97,7 +97,8 @@ def title_of(name: str) -> str:
 
 def notices(product: Mapping[str, Any]) -> Iterator[str]:
     """The most striking findings, a sentence each."""
-    found = [*_outside(product), *_differences(product), *_signals(product), *_gauges(product)]
+    places = [f"{value['text']}." for value in product["places"]]
+    found = [*_outside(product), *places, *_differences(product), *_signals(product), *_gauges(product)]
     yield from found[:POINTED_MOST]
     if len(found) > POINTED_MOST:
         yield f"{len(found) - POINTED_MOST} more in the tables below."

@@ -66,6 +66,8 @@ class Runs:
     rows: list[Row]
     certified: dict[str, Certified]
     skipped: list[str]
+    folder: Path | None = None
+    """Of the certificates; None of a server's runs."""
 
 
 def read_runs(source: str, selection: Selection, tell: Callable[[int, int], None] = lambda done, of: None) -> Runs:
@@ -84,7 +86,7 @@ def read_runs(source: str, selection: Selection, tell: Callable[[int, int], None
     rows = [dict(zip((*NAMES, *TIMES), row, strict=True)) for row in cells]
     rows = [row for row in rows if selection.takes(row)]
     certified, unread = _certificates(folder, rows, tell) if folder is not None else ({}, [])
-    return Runs(source, rows, certified, skipped + unread)
+    return Runs(source, rows, certified, skipped + unread, folder)
 
 
 def _of_server(url: str, given: Mapping[str, int | None]) -> Sequence[tuple[Any, ...]]:

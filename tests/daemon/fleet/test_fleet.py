@@ -18,8 +18,10 @@ from triaxcald.documents import to_text
 from triaxcald.errors import InputError
 from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
 from triaxcald.fleet.reading import certified_in
+from triaxcald.recording.reader import Recording
 from triaxcald.schema.fleet import FleetDocument
 
+GOLDEN = Path(__file__).parents[3] / "recordings"
 FIGURES = {"scale_factor": np.ones(3), "misalignment": np.zeros(3), "bias": np.zeros(3)}
 
 
@@ -267,3 +269,48 @@ def test_wrong_options_are_refused(lined: Path, wrong: list[str]) -> None:
 def test_an_empty_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fleet", str(tmp_path)]) == 2
     assert "no run has measured anything" in capsys.readouterr().err
+
+
+# Effects of places, and odds.
+
+
+def test_a_fixture_that_shifts_a_bias_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "runs", line(units=150, repeated=0))
+    page = tmp_path / "fleet.html"
+    assert main(["fleet", str(folder), "--json", "--report", str(page)]) == 0
+    (product,) = json.loads(capsys.readouterr().out)["products"]
+    (place,) = product["places"]
+    assert (place["kind"], place["place"], place["since"], place["figure"]) == (
+        "fixture", "F2", None, "a shift of bias.y",
+    )  # fmt: skip
+    assert place["probability"] > 0.99
+    assert place["text"] in page.read_text(encoding="utf-8")
+
+
+def test_units_teach_odds_that_diagnose_accepts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Recording.open(GOLDEN / "modbus-temperature-bias.mcap") as recording:
+        paper = json.loads(recording.attachments["certificate.json"])
+    documents = line(units=8, repeated=0)
+    folder = write(tmp_path / "runs", documents, [paper] * len(documents))
+    odds = tmp_path / "odds.json"
+    assert main(["fleet", str(folder), "-o", str(odds), "--json"]) == 0
+    learned = json.loads(odds.read_text())
+    assert (learned["format"], learned["part_number"], learned["units"]) == ("triaxcal.odds/1", "TX-1", 8)
+    others = [of["odds"] for name, of in learned["effects"].items() if name != "temperature_bias"]
+    assert learned["effects"]["temperature_bias"]["odds"] > 5 * max(others)
+    capsys.readouterr()
+    assert main(["diagnose", str(GOLDEN / "paper-unit.csv.gz"), "--sign=-,-,-", "--odds", str(odds), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["odds"]
+    assert (said["part_number"], said["units"]) == ("TX-1", 8)
+
+
+def test_odds_are_of_one_part_number_and_need_certificates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    documents = line(units=4, repeated=0)
+    folder = write(tmp_path / "runs", documents)
+    assert main(["fleet", str(folder), "-o", str(tmp_path / "odds.json")]) == 2
+    assert "no certificates" in capsys.readouterr().err
+    documents[0]["work"]["part_number"] = "TX-2"
+    folder = write(tmp_path / "two", documents)
+    assert main(["fleet", str(folder), "-o", str(tmp_path / "odds.json")]) == 2
+    assert "--part-number" in capsys.readouterr().err
+    assert not (tmp_path / "odds.json").exists()
