@@ -144,14 +144,11 @@ def _coefficients(loop: tc.diagnosis.Loop, name: str) -> tc.diagnosis.Coefficien
 
 # Learned odds on 14 poses.
 
-TYPES = (
-    "second_order_nonlinearity", "third_order_nonlinearity", "scale_factor_asymmetry", "temperature_bias", "warm_up",
-    "hysteresis", "bias_drift", "temperature_scale_factor",
-)  # fmt: skip
-OUTSIDE = (uncatalogued.KINDS[0], uncatalogued.KINDS[5], invented.KINDS[0], invented_later.KINDS[0])
+TYPES = ("warm_up", "third_order_nonlinearity", "hysteresis", "temperature_bias", "second_order_nonlinearity")
+OUTSIDE = (uncatalogued.KINDS[0], invented.KINDS[0], invented_later.KINDS[0])
 OFTEN = 0.7
 """Share of units of a type that have its effect."""
-LEARNED_FROM = 16
+LEARNED_FROM = 12
 
 
 def units_of(kind: str, first: int, count: int) -> list[tuple[tuple[str, ...], tc.Poses, tuple[float, ...]]]:

@@ -27,10 +27,10 @@ CATALOGUE_ODDS = EFFECT_ODDS / len(CATALOGUE)
 UNITS = 4.0
 """Units that the catalogue's odds count as: a type differs from others, and two units
 with an effect are no rule yet."""
-LEAST, MOST = CATALOGUE_ODDS / 10, 0.5
+LEAST, MOST = CATALOGUE_ODDS / 10, 1.0
 """Smallest and largest odds: a unit's own poses overrule them. A tenth costs an effect
-that no unit had what one more pose brings; at 1 : 2 no name is likely before any
-pose."""
+that no unit had what one more pose brings; even odds make no name likely before
+any pose."""
 UNMODELLED_UNITS = 10.0
 """Units that the prior probability of an unmodelled part counts as."""
 UNMODELLED_LEAST = 0.05
