@@ -257,7 +257,7 @@ def test_a_full_disk_for_the_result(finished_run: Any, tmp_path: Path, triaxcal:
         ),
         (["plan", "--for", "temperature_lag"], "this one goes with what a channel was before, for which any plan does"),
         (["record", "station.toml"], "the following arguments are required: -o"),
-        (["log"], "the following arguments are required: info|recover|export"),
+        (["log"], "the following arguments are required: info|recover|delete|export"),
         (["sim", "none.toml"], "none.toml: No such file or directory"),
         (["run", "none.toml"], "none.toml: No such file or directory"),
         (["demo", "--seed", "x"], "argument --seed: expected a whole number of at least 0, not 'x'"),

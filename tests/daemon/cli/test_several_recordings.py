@@ -108,7 +108,7 @@ def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -
 @pytest.mark.parametrize(
     ("arguments", "left"),
     [
-        (["diagnose", "a.csv", "--odd", "b.csv"], "--odd b.csv"),
+        (["diagnose", "a.csv", "--peculiar", "b.csv"], "--peculiar b.csv"),
         (["provision", "a.json", "b.toml", "c.toml"], "c.toml"),
         (["fit", "a.csv", "--sgn=+,-,+"], "--sgn=+,-,+; did you mean --sign?"),
     ],
