@@ -344,7 +344,8 @@ def test_progress_may_be_json_and_the_numbers_are_served(workshop: Any, triaxcal
     assert done.code == 0
     lines = [json.loads(line) for line in done.err.splitlines()]
     assert "http://127.0.0.1:" in lines[0]["message"]
-    assert (lines[-1]["event"], lines[-1]["level"], lines[-1]["recording"]) == ("ended", "info", str(rec))
+    assert (lines[-1]["event"], lines[-1]["recording"]) == ("ended", str(rec))
+    assert lines[-1]["level"] in ("info", "warning")  # of a rate that a busy machine changes
     assert lines[-1]["samples"] >= 500
 
 

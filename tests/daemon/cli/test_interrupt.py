@@ -191,8 +191,8 @@ def test_a_recording_is_finished_and_the_device_left_alone(
         assert (unit["exit_code"], unit["device_state"], unit["registers_written"]) == (130, None, [])
         path = unit["recording"]
     else:
-        assert f"{path}: " in done.err.splitlines()[-2]
-        assert " samples in " in done.err.splitlines()[-2]
+        # A busy machine changes the rate of a simulated unit, and a warning may follow.
+        assert any(line.startswith(f"{path}: ") and " samples in " in line for line in done.err.splitlines())
     info = triaxcal("log", "info", path, "--json").json
     assert info["finished"] is True
     assert int(info["metadata"]["raw"]["records"]) == info["raw"]["calibration"]["records"] > 0
