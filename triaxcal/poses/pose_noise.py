@@ -488,7 +488,8 @@ def _track(w: Windows, s: Span, at_once: int) -> Track:
     windows."""
     place = np.round((w.start_ns[s.used] - w.start_ns[s.first]) / w.period_ns).astype(np.int64)
     place = np.maximum.accumulate(place - np.arange(len(place))) + np.arange(len(place))
-    deviation = w.mean[s.used] - w.mean[s.used].mean(axis=0)
+    deviation = w.mean[s.used]
+    deviation -= deviation.mean(axis=0)
     if at_once == 1:
         return Track(place, deviation)
     first = np.flatnonzero(np.diff(place // at_once, prepend=-1))

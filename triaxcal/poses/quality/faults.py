@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.arrays import Bools, Floats, Ints, joined
+from triaxcal.arrays import Bools, Columns, Floats, Ints
 from triaxcal.poses.quality.finding import (
     AXES,
     AtRail,
@@ -24,7 +24,7 @@ from triaxcal.poses.quality.finding import (
     StillIntervals,
     StuckOutput,
 )
-from triaxcal.poses.stillness.windows import PARTS_MOST, noise_of
+from triaxcal.poses.stillness.windows import noise_of
 
 # Extremes of every tenth of a second with their counts, and the step of the output.
 
@@ -97,8 +97,7 @@ class CellKeeper:
     """Collects cells from whole cells of samples, in order."""
 
     size: int
-    _done: list[tuple[Any, ...]] = field(default_factory=list)  # as Cells has them, behind its size
-    _whole: int = 0  # of which so many are `PARTS_MOST` joined
+    _done: Columns = field(default_factory=Columns)  # as Cells has them, behind its size
 
     def feed(self, time_ns: Ints, u: Floats) -> None:
         """``u`` (3,n), n a multiple of ``size``."""
@@ -108,19 +107,14 @@ class CellKeeper:
         small = np.min_scalar_type(self.size)  # there is one for each tenth of a second, however long
         at_high = np.count_nonzero(blocks == high[:, :, None], axis=2).astype(small)
         at_low = np.count_nonzero(blocks == low[:, :, None], axis=2).astype(small)
-        self._done.append((times[:, 0].copy(), times[:, -1].copy(), _short(high.T), _short(low.T), at_high.T, at_low.T))
-        if len(self._done) - self._whole >= PARTS_MOST:
-            self._done[self._whole :] = [joined(self._done[self._whole :])]
-            self._whole += 1
+        self._done.add((times[:, 0], times[:, -1], _short(high.T), _short(low.T), at_high.T, at_low.T))
 
     def cells(self) -> Cells:
-        if not self._done:
+        if not len(self._done):
             none = np.zeros(0, dtype=np.int64)
             empty = np.zeros((0, 3))
             return Cells(self.size, none, none, empty, empty, empty.astype(np.int64), empty.astype(np.int64))
-        if len(self._done) > 1:
-            self._done, self._whole = [joined(self._done)], 1
-        return Cells(self.size, *self._done[0])
+        return Cells(self.size, *self._done.arrays())
 
 
 def _short(values: Floats) -> Floats:

@@ -179,7 +179,7 @@ class Spectra:
         return found
 
     def _judged(self, band: Band, chosen: Ints, alarm: float) -> Line | None:
-        """The line of a band from the power of the ``chosen`` segments (m,)."""
+        """The line of a band from the power of ``chosen`` segments (m,), or None."""
         amplitude, places, least = np.zeros(3), np.zeros(3), 1.0
         bin_hz = 1e9 / self.period_ns / self.size
         first = int(np.searchsorted(self._kept, band.bins[0]))

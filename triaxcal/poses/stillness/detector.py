@@ -155,7 +155,7 @@ class StillnessDetector(WindowCutter):
 
     def windows(self) -> Windows:
         """Raises TooShort where there is not one whole window yet."""
-        if not self._done:
+        if not len(self._done):
             period_ns = self._period_ns or (self.span_ns / (self.samples - 1) if self.samples > 1 else math.inf)
             if self._period_ns and self.samples >= least_samples(period_ns):
                 raise _too_short(self._longest, (self._longest - 1) * period_ns, period_ns, in_pieces=True)
@@ -292,13 +292,13 @@ def _frozen(w: Windows, step: Floats) -> Bools:
     with changes of a step or two.
     """
     frozen = np.zeros((len(w), 3), dtype=bool)
-    # A single reading that differs by a step would exceed either limit.
-    repeats = w.variance < step**2 / (2 * w.size)
-    same = np.abs(np.diff(w.mean, axis=0, prepend=w.mean[:1])) < step / (2 * w.size)
     for axis in range(3):
+        # A single reading that differs by a step would exceed either limit.
+        repeats = w.variance[:, axis] < step[axis] ** 2 / (2 * w.size)
+        same = np.abs(np.diff(w.mean[:, axis], prepend=w.mean[0, axis])) < step[axis] / (2 * w.size)
         # Runs of equal windows; other repeats must be rarer than live windows.
-        found = runs(repeats[:, axis], w.joined & same[:, axis])
-        live = w.variance[~repeats[:, axis], axis]
+        found = runs(repeats, w.joined & same)
+        live = w.variance[~repeats, axis]
         again = sum(map(len, found)) - max(map(len, found), default=0)
         if again < len(live) and np.quantile(live, 0.01) > step[axis] ** 2:
             for run in found:
@@ -374,8 +374,8 @@ def _limit_within(variance: Floats, most: int) -> Floats:
     """(3,) the same limit from windows nearly all of which are still: chi-square with
     the degrees of freedom (``most`` at most) that match the interquartile range of
     the logarithm."""
-    log = np.log(np.maximum(variance, 1e-300))
-    low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
+    logs = (np.log(np.maximum(variance[:, axis], 1e-300)) for axis in range(3))
+    low, middle, high = np.array([np.quantile(log, [0.25, 0.5, 0.75]) for log in logs]).T
     tried = np.geomspace(0.5, most, 80)
     spreads = np.log(chi2_ppf(0.75, tried) / chi2_ppf(0.25, tried))
     dof = np.interp(-(high - low), -spreads, tried)
@@ -401,16 +401,21 @@ def _only_moves(w: Windows, calm: Bools) -> bool:
     the variance inside one. Slow vibration shows the same, but is small compared with
     the differences of poses and returns.
     """
-    # Squared steps over the variance inside the windows.
-    at, step = contrasts(w.mean, calm, w.joined, 1, 1)
+    # Axis by axis, since a recording may last for days: squared steps over the
+    # variance inside the windows, and their size.
+    at = unbroken(calm, w.joined, 1, 1)
     if not len(at):
         return False
-    share = step**2 / np.maximum((w.variance[at] + w.variance[at - 1]) / 2, 1e-300)
-    if not (np.quantile(share, 0.25, axis=0) > MOTION).any():
+    moves, pace = False, np.zeros(3)
+    for axis in range(3):
+        step, inside = contrast(w.mean[:, axis : axis + 1], at, 1, 1)[:, 0], w.variance[:, axis]
+        share = step**2 / np.maximum((inside[at] + inside[at - 1]) / 2, 1e-300)
+        moves |= bool(np.quantile(share, 0.25) > MOTION)
+        pace[axis] = np.median(np.abs(step))
+    if not moves:
         return False
     # Motion goes on in one direction, or is large against the range.
     _, far = contrasts(w.mean, calm, w.joined, SCALES[-1], SCALES[-1])
-    pace = np.median(np.abs(step), axis=0)
     leads = len(far) > 0 and (np.median(np.abs(far), axis=0) > 3 * pace).any()
     return bool(leads or pace.max() > SLIGHT * np.ptp(w.mean, axis=0).max())
 
@@ -431,31 +436,54 @@ def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
 def _moved(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     """Windows that begin a significant change between averages over ``scale``
     windows."""
-    at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
+    at, sigma = unbroken(steady, w.joined, scale, scale), noise.step[scale]
     if not len(at):
         return at
-    sigma = noise.step[scale]
+    # Axis by axis: a recording may last for days.
+    out = np.zeros(len(at), dtype=bool)
     if scale == 1:
-        return np.asarray(at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)])
+        for axis in range(3):
+            difference = contrast(w.mean[:, axis : axis + 1], at, 1, 1)[:, 0]
+            out |= np.abs(difference) > STEP_SIGMA * sigma[axis]
+        return np.asarray(at[out])
     # Subtract the common climb of the run: steady creep is no move.
-    difference -= _common_climb(at, difference / sigma) * sigma
-    return np.asarray(at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)])
+    differences = contrast(w.mean, at, scale, scale)
+    size = np.zeros(len(at))
+    for axis in range(3):
+        np.maximum(size, np.abs(differences[:, axis] / sigma[axis]), out=size)
+    quiet = _Quietest.of(at, size)
+    for axis in range(3):
+        climb = quiet.common_climb(differences[:, axis] / sigma[axis])
+        out |= np.abs(differences[:, axis] - climb * sigma[axis]) > MOVE_SIGMA * sigma[axis]
+    return np.asarray(at[out])
 
 
-def _common_climb(at: Ints, z: Floats) -> Floats:
-    """(len, 3) mean of the smallest quarter of the differences in each run: the rate
-    of a steady creep."""
-    begins = np.diff(at, prepend=at[0] - 2) > 1
-    run, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
-    length = np.diff(first, append=len(at))
-    # Run by run the quietest first: in that order they are added up.
-    ordered = np.lexsort((np.abs(z).max(axis=1), run))
-    count = np.maximum(length // 4, 1)
-    quiet = ordered[np.arange(len(at)) - first[run] < count[run]]
-    climb = np.zeros((len(count), 3))
-    np.add.at(climb, run[quiet], z[quiet])
-    climb /= count[:, None]
-    return np.asarray(np.where(np.abs(climb) > 1, climb, 0.0)[run])
+@dataclass(frozen=True)
+class _Quietest:
+    """The smallest quarter of the differences in each run: the ``places`` (q,) of
+    these, run by run, ``count`` (r,) of each run, and the ``run`` (len,) of all."""
+
+    places: Ints
+    count: Ints
+    run: Ints
+
+    @classmethod
+    def of(cls, at: Ints, size: Floats) -> _Quietest:
+        begins = np.diff(at, prepend=at[0] - 2) > 1
+        run, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
+        length = np.diff(first, append=len(at))
+        # Run by run the quietest first: in that order they are added up.
+        ordered = np.lexsort((size, run))
+        count = np.maximum(length // 4, 1)
+        return cls(ordered[np.arange(len(at)) - first[run] < count[run]], count, run)
+
+    def common_climb(self, z: Floats) -> Floats:
+        """(len,) mean of these differences in each run, from ``z`` (len,): the rate of
+        a steady creep."""
+        climb = np.zeros(len(self.count))
+        np.add.at(climb, self.run[self.places], z[self.places])
+        climb /= self.count
+        return np.asarray(np.where(np.abs(climb) > 1, climb, 0.0)[self.run])
 
 
 def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
@@ -466,7 +494,9 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     limit = MOVE_SIGMA * noise.edge[scale]
     behind, ahead = unbroken(steady, w.joined, 4 * scale, scale), unbroken(steady, w.joined, scale, 4 * scale)
     # Places with four times as many still windows on either side.
-    at = np.intersect1d(behind, ahead - scale, assume_unique=True)
+    among = np.zeros(len(w), dtype=bool)
+    among[behind] = True
+    at = ahead[among[ahead - scale]] - scale
     out = np.zeros(len(at), dtype=bool)
     for axis in range(3):  # one by one: a recording may last for days
         mean = w.mean[:, axis : axis + 1]

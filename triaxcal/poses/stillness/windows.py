@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
-from triaxcal.arrays import READING_MOST, Bools, Floats, Ints, joined
+from triaxcal.arrays import READING_MOST, Bools, Columns, Floats, Ints
 from triaxcal.errors import InvalidData
 from triaxcal.poses.arrivals import GAP, RATE_LEAST, RATE_S, RATE_SAMPLES, first_period_ns
 
@@ -25,11 +24,6 @@ WINDOW_S = 0.1
 sample, so that summaries are few."""
 WINDOW_LEAST = 3
 """Samples in a window at low rates: fewer do not determine a scatter."""
-
-
-PARTS_MOST = 256
-"""Small arrays that are kept until they are joined: they lie among those that are given
-up, and would keep their memory from being used again."""
 
 
 def window_size(period_ns: float) -> int:
@@ -89,13 +83,10 @@ class WindowCutter:
     _size: int = 0
     _period_ns: float = 0.0
     _names: tuple[str, ...] = ()
-    _done: list[tuple[Any, ...]] = field(default_factory=list)
+    _done: Columns = field(default_factory=Columns)
     """As `Windows` has them, without the hops, the channels last."""
-    _whole: int = 0
-    """How many of these are `PARTS_MOST` joined."""
-    _hops: list[tuple[Any, ...]] = field(default_factory=list)
+    _hops: Columns = field(default_factory=Columns)
     """Windows with a hop, by number, and their hops."""
-    _count: int = 0
     _last_ns: int | None = None
     _broken: bool = False
 
@@ -167,7 +158,7 @@ class WindowCutter:
         cross = (rest * rest[:, [1, 2, 0]]).sum(axis=2) / (self._size - 1)
         times = time_ns.reshape(count, self._size)
         in_one_piece = np.ones(count, dtype=bool)
-        in_one_piece[0] = not self._broken and bool(self._done)
+        in_one_piece[0] = not self._broken and len(self._done) > 0
         self._broken = False
         self._names = tuple(channels)
         means = [v.reshape(count, self._size).mean(axis=1) for v in channels.values()]
@@ -175,24 +166,17 @@ class WindowCutter:
         hop = _hop(columns)
         at = np.flatnonzero(hop.any(axis=1))
         if len(at):
-            self._hops.append((self._count + at, hop[at]))
-        self._count += count
-        self._done.append((times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, in_one_piece, *means))
-        if len(self._done) - self._whole >= PARTS_MOST:
-            self._done[self._whole :] = [joined(self._done[self._whole :])]
-            self._whole += 1
+            self._hops.add((len(self._done) + at, hop[at]))
+        self._done.add((times[:, 0], times[:, -1], mean, variance, cross, in_one_piece, *means))
 
     def windows(self) -> Windows:
         """Raises InvalidData where there is not one whole window yet."""
-        if not self._done:
+        if not len(self._done):
             raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
-        if len(self._done) > 1:
-            self._done, self._whole = [joined(self._done)], 1
-        if len(self._hops) > 1:
-            self._hops = [joined(self._hops)]
-        start, end, mean, variance, cross, in_one_piece, *channels = self._done[0]
-        hop = np.zeros_like(mean)  # of which no memory is taken where nothing is written
-        for at, values in self._hops:
+        start, end, mean, variance, cross, in_one_piece, *channels = self._done.arrays()
+        hop = np.zeros(mean.shape)  # takes no memory where nothing is written
+        if len(self._hops):
+            at, values = self._hops.arrays()
             hop[at] = values
         named = dict(zip(self._names, channels, strict=True))
         return Windows(self._size, start, end, mean, variance, cross, hop, named, in_one_piece)
@@ -272,14 +256,14 @@ def _steps(w: Windows) -> tuple[Floats, Floats]:
 
 def _least_difference(w: Windows) -> Floats:
     """(3,) smallest difference of the sums of windows."""
-    sums = w.mean * w.size
-    least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
-    out = least.copy()
-    for i in range(3):
-        gaps = np.diff(np.unique(sums[:, i]))
-        gaps = gaps[gaps > least[i]]
+    out = np.zeros(3)
+    for i in range(3):  # one by one: a recording may last for days
+        sums = w.mean[:, i] * w.size
+        least = 1e-12 * np.max(np.abs(sums), initial=1e-100)
+        gaps = np.diff(np.unique(sums))
+        gaps = gaps[gaps > least]
         fine = len(gaps) > 0 and gaps.min() * COARSEST < np.ptp(w.mean[:, i])
-        out[i] = gaps.min() if fine else least[i]
+        out[i] = gaps.min() if fine else least
     return out
 
 
@@ -422,8 +406,8 @@ class NoiseScales:
         With wide steps most differences are zero, and a median does not show the
         variance half-way between two steps.
         """
-        base = w.variance[still] if still.any() else w.variance
-        scatter = np.sqrt(np.median(base, axis=0))
+        base = still if still.any() else slice(None)
+        scatter = np.sqrt([np.median(w.variance[base, axis]) for axis in range(3)])
         quantile = 0.25 if first else 0.5
         step: dict[int, Floats] = {}
         edge: dict[int, Floats] = {}
@@ -431,13 +415,13 @@ class NoiseScales:
         # variance.
         for s in SCALES:
             share = 2 / (w.size * s)
-            found = contrasts(w.mean, still, w.joined, s, s)[1]
             least = np.maximum(2 * rounding.residue, rounding.widest * share)
-            step[s] = _scale(found, quantile, least, scatter**2 * share, step.get(s // 2))
+            found = _quantile(w, unbroken(still, w.joined, s, s), (s, s), quantile)
+            step[s] = _scale(found, least, scatter**2 * share, step.get(s // 2))
             share = 1.25 / (w.size * s)
-            found = contrasts(w.mean, still, w.joined, 4 * s, s)[1]
             least = np.maximum(2 * rounding.residue, rounding.widest * share)
-            edge[s] = _scale(found, quantile, least, scatter**2 * share, edge.get(s // 2))
+            found = _quantile(w, unbroken(still, w.joined, 4 * s, s), (4 * s, s), quantile)
+            edge[s] = _scale(found, least, scatter**2 * share, edge.get(s // 2))
         return cls(step, edge, scatter)
 
     def of_edge(self, scale: int, before: int) -> Floats:
@@ -446,14 +430,23 @@ class NoiseScales:
         return np.asarray(self.edge[scale] * np.sqrt((1 / scale + 1 / before) / (1.25 / scale)))
 
 
-def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, half: Floats | None) -> Floats:
-    """(3,) standard deviation from a quantile of the absolute differences; with too
-    few of them, from half the scale as for white noise. At least the variance
-    ``least`` (3,)."""
-    if len(differences) >= ENOUGH:
-        # A normal variable is within 0.3186 and 0.6745 standard deviations in a
-        # quarter and in half of all cases.
-        sigma = np.quantile(np.abs(differences), quantile, axis=0) / {0.25: 0.31864, 0.5: 0.67449}[quantile]
+def _quantile(w: Windows, at: Ints, lengths: tuple[int, int], quantile: float) -> Floats | None:
+    """(3,) standard deviation from a quantile of the absolute differences of averages
+    over windows before and after ``at``; None with too few of them."""
+    if len(at) < ENOUGH:
+        return None
+    # Axis by axis: a recording may last for days.
+    each = (contrast(w.mean[:, axis : axis + 1], at, *lengths)[:, 0] for axis in range(3))
+    # A normal variable is within 0.3186 and 0.6745 standard deviations in a
+    # quarter and in half of all cases.
+    return np.array([np.quantile(np.abs(found), quantile) for found in each]) / {0.25: 0.31864, 0.5: 0.67449}[quantile]
+
+
+def _scale(found: Floats | None, least: Floats, white: Floats, half: Floats | None) -> Floats:
+    """(3,) the standard deviation that was ``found``; without one, from half the scale
+    as for white noise. At least the variance ``least`` (3,)."""
+    if found is not None:
+        sigma = found
     elif half is not None:
         sigma = half / np.sqrt(2)
     else:
@@ -476,11 +469,11 @@ def unbroken(still: Bools, joined: Bools, before: int, after: int) -> Ints:
     n = len(still)
     broken = np.ones(n + 1, dtype=bool)
     broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
-    breaks = np.cumsum(broken)
-    i = np.arange(before, n - after + 1)
+    breaks = np.cumsum(broken, dtype=np.int32)
     # Between the first and the last of them no boundary is broken; a single
     # window must be still itself.
-    at = i[breaks[i + after - 1] == breaks[i - before]]
+    reach = before + after - 1
+    at = before + np.flatnonzero(breaks[reach:n] == breaks[: max(n - reach, 0)])
     return np.asarray(at[still[at - before]] if len(at) else at, dtype=np.int64)
 
 
@@ -491,10 +484,15 @@ def contrast(values: Floats, at: Ints, before: int, after: int) -> Floats:
     out = np.empty((len(at), values.shape[1]))
     for axis in range(values.shape[1]):  # one by one: a recording may last for days
         # Differences of cumulative sums.
-        sums = np.concatenate([[0.0], np.cumsum(values[:, axis] - values[0, axis])])
-        here = (sums[at] - sums[at - before]) / max(before, 1)
-        there = (sums[at + after] - sums[at]) / max(after, 1)
-        out[:, axis] = there - here + offset[axis]
+        sums = np.zeros(len(values) + 1)
+        np.cumsum(values[:, axis] - values[0, axis], out=sums[1:])
+        middle, there = sums[at], sums[at + after]
+        there -= middle
+        there /= max(after, 1)
+        middle -= sums[at - before]
+        middle /= max(before, 1)
+        there -= middle
+        out[:, axis] = there + offset[axis]
     return out
 
 
