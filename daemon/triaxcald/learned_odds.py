@@ -4,6 +4,7 @@ another part number, and carried in the recording."""
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import triaxcal as tc
 from triaxcald.errors import InputError
 from triaxcald.inputs import document_bytes, parse_document
 from triaxcald.station.config import Station
+from triaxcald.work import Work
 
 RECORD = "odds"
 """The metadata record that names it."""
@@ -66,3 +68,14 @@ def odds_of_station(station: Station) -> OddsFile | None:
         return OddsFile.read(str(station.path.parent / station.file.odds))
     except (InputError, tc.TriaxcalError) as e:
         raise InputError(f"{where}: {e}") from e
+
+
+def odds_for(station: Station, work: Mapping[str, Work], path: str | None = None) -> OddsFile | None:
+    """The odds in the file at ``path``, else those that the station names, for units
+    that are measured for this ``work``, by slot. Raises InputError; InvalidData for
+    another part number."""
+    odds = OddsFile.read(path) if path else odds_of_station(station)
+    if odds is not None:
+        for slot, of_unit in work.items():
+            odds.require_of(of_unit.part_number, f"unit {slot}")
+    return odds

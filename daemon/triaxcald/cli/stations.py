@@ -56,12 +56,9 @@ def run_command(a: argparse.Namespace) -> int:
         from triaxcald.earlier_calibration import earlier_by_unit
 
         rezero = earlier_by_unit(a.rezero, station)
-    from triaxcald.learned_odds import OddsFile, odds_of_station
+    from triaxcald.learned_odds import odds_for
 
-    odds = OddsFile.read(a.odds) if a.odds else odds_of_station(station)
-    if odds is not None:
-        for slot, of_unit in work.items():
-            odds.require_of(of_unit.part_number, f"unit {slot}")
+    odds = odds_for(station, work, a.odds)
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.unit_run import TrayRun
     from triaxcald.schema.run import Run

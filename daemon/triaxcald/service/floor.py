@@ -13,7 +13,9 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+import triaxcal as tc
 from triaxcald.errors import DaemonError, InputError
+from triaxcald.learned_odds import odds_for, odds_of_station
 from triaxcald.memory import give_back
 from triaxcald.run.attempts import Killed, settle_killed
 from triaxcald.run.events import Events
@@ -295,14 +297,15 @@ class Floor:
             station = with_serials(station, scanned)
             work = await asyncio.to_thread(works, station, given)
             check_lines(station.places, where=str(station.path))
+            odds = await asyncio.to_thread(odds_for, station, work)
         except RuleBroken as e:
             problem = _OF_RULE.get(e.rule, Problem.INVALID)
             raise ApiError(problem, _told(e)) from e
-        except InputError as e:
+        except (InputError, tc.InvalidData) as e:
             raise ApiError(Problem.INVALID, str(e)) from e
         receiver = _Receiver(self._took, self.stream)
         tray = TrayRun(
-            station, receiver, work=work, ended=receiver.ended, killed=self._settled, begun=receiver.begun
+            station, receiver, work=work, odds=odds, ended=receiver.ended, killed=self._settled, begun=receiver.begun
         )  # fmt: skip
         receiver.of(tray)
         return tray
@@ -432,6 +435,7 @@ class Floor:
                 station = await asyncio.to_thread(self._load)
                 self._require_same_place(station)
                 await asyncio.to_thread(golden_calibration, station)
+                await asyncio.to_thread(odds_of_station, station)
             except Exception as e:  # noqa: BLE001 - the old station file stays in use
                 self._log(f"triaxcal: not loaded again, the old station file stays in use: {e}")
                 return
