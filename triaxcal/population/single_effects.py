@@ -703,20 +703,19 @@ class _Level:
             allowed = self._allowed(sums, known)
             score = sums.by_cell(pull)
             information, taken = sums.by_cell(precise.diagonal), self._by_part(sums, ones, ones)
-            squares = sums.by_cell(pull**2)
-            whole = np.sum(pull**2, axis=0), np.maximum(np.sum(precise.diagonal, axis=0), 2 * TINY)
+            scatter = _LocalScatter(sums, left, weight, rest)
             for form in (Form.SHIFT, Form.DRIFT):
                 if form is Form.SHIFT:
                     s, h = sums.by_window(score), sums.by_window(information)
                     h = h + sums.pairs_by_window(pairs, between)
                     h = h - sum(sums.by_window(part) ** 2 / total for part, total in taken)
-                    varies = sums.by_window(squares), sums.by_window(information)
+                    spread = scatter.of_windows()
                     base = allowed
                 else:
                     s, h = sums.by_ramp(score), sums.by_ramp(information, 2)
                     h = h + sums.pairs_by_ramp(pairs, between)
                     h = h - sum(sums.by_ramp(part) ** 2 / total for part, total in taken)
-                    varies = sums.by_ramp(squares, 2), sums.by_ramp(information, 2)
+                    spread = scatter.of_ramps()
                     everything = allowed.max(axis=1)
                     base = (
                         self.grid.ramps[1]
@@ -724,15 +723,6 @@ class _Level:
                         + np.where(np.isfinite(everything), 0, -np.inf)[:, None]
                     )
                 h = np.maximum(h, 0.0)
-                # Where runs scatter more, inside or outside, a difference is less
-                # certain (Welch 1947, Biometrika 34:28).
-                inside, outside = np.maximum(varies[1], TINY), np.maximum(whole[1] - varies[1], TINY)
-                within = (varies[0] - s**2 / inside) / inside
-                without = (whole[0] - varies[0] - s**2 / outside) / outside
-                spread = (within * outside + without * inside) / whole[1]
-                if form is Form.DRIFT:
-                    spread = (varies[0] - s**2 / np.maximum(h, TINY)) / inside
-                spread = np.maximum(spread, 1.0)
                 s, h = s / spread, h / spread
                 prior = base + start + np.log(search.prior.forms[form]) - np.log(len(patterns))
                 for name, vectors, by_run, scale in patterns:
@@ -955,6 +945,45 @@ class _Level:
             return np.asarray(inside * self.grid.ramps[0][window][self.grid.cell])
         first, end = self.grid.windows.first[window], self.grid.windows.end[window]
         return np.asarray(inside * ((self.grid.cell >= first) & (self.grid.cell < end)))
+
+
+class _LocalScatter:
+    """Variance of runs over that of all, from 1 on: where they scatter more, a
+    difference is less certain (Welch 1947, Biometrika 34:28)."""
+
+    def __init__(self, sums: Sums, left: Floats, weight: Floats, rest: Floats) -> None:
+        """``left`` (N,d) with its ``weight`` (N,d), and the ``rest`` that all effects
+        leave."""
+        self.sums = sums
+        known = (weight > 0).astype(float)
+        moments = (known, weight, weight * left, weight * left**2)
+        self.cells = [sums.by_cell(moment) for moment in moments]
+        self.whole = [moment.sum(axis=0) for moment in moments]
+        centre = (weight * rest).sum(axis=0) / np.maximum(weight.sum(axis=0), TINY)
+        self.usual = (weight * (rest - centre) ** 2).sum(axis=0) / np.maximum(known.sum(axis=0), 1.0)
+
+    def _variance(self, n: Floats, weight: Floats, first: Floats, second: Floats) -> Floats:
+        return np.asarray((second - first**2 / np.maximum(weight, TINY)) / np.maximum(n * self.usual, TINY))
+
+    def of_windows(self) -> Floats:
+        """(n,w,d) of the difference between a place and time, and the rest."""
+        inside = [self.sums.by_window(cells) for cells in self.cells]
+        outside = [whole - own for whole, own in zip(self.whole, inside, strict=True)]
+        share = inside[0] / np.maximum(self.whole[0], 1.0)
+        both = self._variance(*inside) * (1 - share) + self._variance(*outside) * share
+        return np.asarray(np.maximum(both, 1.0))
+
+    def of_ramps(self) -> Floats:
+        """(n,k,d) about a straight line after each ramp's beginning."""
+        n, weight, first, second = (cells.sum(axis=1)[:, None] for cells in self.cells)
+        ramp, square, product = (
+            self.sums.by_ramp(self.cells[1]),
+            self.sums.by_ramp(self.cells[1], 2),
+            self.sums.by_ramp(self.cells[2]),
+        )
+        weight = np.maximum(weight, TINY)
+        along = (product - first * ramp / weight) ** 2 / np.maximum(square - ramp**2 / weight, TINY)
+        return np.maximum(self._variance(n, weight, first, second - along), 1.0)
 
 
 UNITS = 3.0
