@@ -85,9 +85,10 @@ def _effects_in(loop: schema.Loop) -> dict[str, SeenEffect]:
     poses could not show are not known; a name that is not listed is unlikely."""
     odds = {} if loop.odds is None else {name: o for name, o in loop.odds.effects.items() if o is not None}
     stated: dict[str, float | None] = dict.fromkeys((e.name for e in CATALOGUE), 0.0)
-    stated |= dict.fromkeys(loop.calibration.blind_to)
     stated |= loop.probabilities
     stated |= {f.effect: f.probability for f in loop.findings}
+    blind = [name for name in loop.calibration.blind_to if not stated.get(name)]
+    stated = {name: p for name, p in stated.items() if name not in blind}
     return seen_effects(stated, [(f.effect, f.probabilities) for f in loop.findings if f.alternatives], odds)
 
 

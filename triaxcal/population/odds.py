@@ -38,6 +38,10 @@ UNMODELLED_LEAST = 0.05
 without one lower it to a quarter at most."""
 ROUNDS = 200
 """Of expectation and maximisation: more than it takes to settle to three digits."""
+UNCERTAIN = 0.35
+"""Probability of a likely name whose probability is not calibrated: half of what it
+would be, because a likely name is wrong where the truth is in no catalogue. To leave it
+out would count its competitors alone."""
 EDGE = 1e-3
 """By which a name among others stays below certain."""
 FLOOR = 1e-6
@@ -151,9 +155,8 @@ class _Unit:
     @classmethod
     def of(cls, unit: SeenUnit, names: Sequence[str]) -> _Unit:
         seen = [unit.effects.get(name) for name in names]
-        # A probability that is not calibrated says nothing.
-        known = np.array([s is not None and s.probability is not None for s in seen], dtype=bool)
-        p = np.array([s.probability if s is not None and s.probability is not None else 0.0 for s in seen])
+        known = np.array([s is not None for s in seen], dtype=bool)
+        p = np.array([0.0 if s is None else UNCERTAIN if s.probability is None else s.probability for s in seen])
         odds = np.array([s.prior_odds if s is not None and s.prior_odds > 0 else CATALOGUE_ODDS for s in seen])
         certain = known & (p >= Odds().certain)
         rest = np.where(known & ~certain, np.maximum(p, FLOOR), 0.0)

@@ -143,9 +143,13 @@ LARGEST_FACTOR = 30.0
 UNKNOWN_LIKELY, UNLISTED = 0.5, 0.05
 """Probability of an effect that is likely and not calibrated; and likelihood ratio of
 one that a run does not list."""
-SWEEPS, MORE_SWEEPS = 2, 2
-"""Passes over all single effects after a further one, and over them in the end: each
-changes them less."""
+SWEEPS, MORE_SWEEPS = 2, 10
+"""Passes over all single effects after a further one, and at most in the end: each
+changes them less, by half where two overlap in time."""
+SIMPLE = 4
+"""Most effects that are looked for in place of one of several coefficients."""
+SETTLED = 0.02
+"""Change of an effect, in spreads, that is none."""
 FINER = 10
 """Moments between which a change point is looked for again."""
 
@@ -165,6 +169,19 @@ class SingleEffect:
     factor: float = 1.0
     factor_error: float = 0.0
     """Of more scatter, under the likeliest hypothesis, with its standard error."""
+
+    def is_as(self, other: SingleEffect) -> bool:
+        """Whether both are the same, to a small part of a spread."""
+        if (self.added.keys(), self.scale.keys(), self.rate.keys()) != (
+            other.added.keys(),
+            other.scale.keys(),
+            other.rate.keys(),
+        ):
+            return False
+        pairs = [(self.added[g], other.added[g]) for g in self.added]
+        pairs += [(self.scale[g][0], other.scale[g][0]) for g in self.scale]
+        pairs += [(self.rate[name], other.rate[name]) for name in self.rate]
+        return all(float(np.abs(a - b).max()) < SETTLED for a, b in pairs)
 
     def acts_on(self, subject: int | str) -> bool:
         return subject in self.added or subject in self.scale or subject in self.rate
@@ -187,6 +204,8 @@ class Search:
         self.likelihood = _likelihoods(runs)
         self.effects: list[SingleEffect] = []
         self.nothing = 1.0
+        self.several = True
+        """Whether several coefficients may shift together."""
         self._standardise({})
 
     @classmethod
@@ -212,7 +231,45 @@ class Search:
             self._standardise(self._fitted())
             self.effects = []
             self._grow()
+            self._simplify()
         return self.effects
+
+    def _simplify(self) -> None:
+        """A shift of several coefficients may be two effects of one coefficient each,
+        at places that overlap: look for these, and keep what describes the runs with
+        fewer coefficients (Schwarz 1978, Ann. Stat. 6:461)."""
+        found, nothing = self.effects, self.nothing
+        if not any(self._is_of_several(effect) for effect in found):
+            return
+        score = self._score()
+        self.several, self.effects, self._cache = False, [], {}
+        self._grow(SIMPLE)
+        if len(self.effects) > SIMPLE or self._score() < score:
+            self.effects, self.nothing = found, nothing
+        self.several = True
+
+    def _is_of_several(self, effect: SingleEffect) -> bool:
+        family, _, _ = effect.posterior.best()
+        return (
+            family.group >= 0
+            and family.pattern == SEVERAL
+            and family.form in (Form.SHIFT, Form.DRIFT)
+            and self.groups[family.group].group.kind is FigureKind.COEFFICIENTS
+        )
+
+    def _score(self) -> float:
+        """Log likelihood of all components of the coefficients, less half the log of
+        the number of runs for each coefficient, place and time."""
+        level = _Level(self, self.effects, TimeGrid.of(self.time))
+        out = 0.0
+        for g, group in enumerate(self.groups):
+            if group.group.kind is FigureKind.COEFFICIENTS:
+                out += level.log_likelihood(g)
+        for effect in self.effects:
+            family, _, _ = effect.posterior.best()
+            count = 1 if family.score is None else family.score.shape[-1]
+            out -= 0.5 * (count + 2) * np.log(len(self.runs))
+        return out
 
     def _fitted(self) -> dict[int, Floats]:
         out = {}
@@ -222,18 +279,21 @@ class Search:
                 out[g] = (np.asarray(z) @ group.back.T) * group.spread[self.part]
         return out
 
-    def _grow(self) -> None:
-        for _ in range(self.prior.most):
-            before, found = len(self.effects), self._further()
+    def _grow(self, most: int | None = None) -> None:
+        for _ in range(self.prior.most if most is None else most + 1):
+            count, found = len(self.effects), self._further()
             if found is None:
                 break
             self.effects.append(found)
             for _ in range(SWEEPS):
                 self._sweep()
-            if len(self.effects) <= before:  # one that others explain
+            if len(self.effects) <= count:  # one that others explain
                 break
-        for _ in range(MORE_SWEEPS if len(self.effects) > 1 else 0):
+        for _ in range(MORE_SWEEPS):
+            before = list(self.effects)
             self._sweep()
+            if self.effects == before:
+                break
 
     def _sweep(self) -> None:
         """Each effect anew, given all others; with finer moments about its change."""
@@ -292,6 +352,8 @@ class Search:
         grid = TimeGrid.of(self.time, finer, passing=bool(passing))
         level = _Level(self, others, grid, effect)
         found = self._effect(level, [family for subject in subjects for family in level.of(subject)], grid, finer)
+        if found is not None and found.is_as(effect):
+            found = effect
         if found is not None:
             found.after = after
         return found
@@ -563,6 +625,17 @@ class _Level:
         weight = weight * robust * np.clip(calibrated, 0.3, 1.2)
         return self._centred(left, weight), weight
 
+    def log_likelihood(self, g: int) -> float:
+        """Of what the effects leave, with Student's t."""
+        left, scale = self._left(g), np.ones((1, 1))
+        weight = self.search.groups[g].weight
+        for effect in self.given:
+            if g in effect.scale:
+                scale = scale * effect.scale[g][0]
+        r = self._centred(left, weight / scale**2) * np.sqrt(weight) / scale
+        each = -0.5 * (TAILS + 1) * np.log1p(r**2 / TAILS) - np.log(scale)
+        return float(np.sum(np.where(weight > 0, each, 0.0)))
+
     def _left(self, g: int) -> Floats:
         """(N,d) of the components what the other effects leave."""
         added = (effect.added[g] for effect in self.given if g in effect.added)
@@ -617,26 +690,32 @@ class _Level:
 
     def _means(self, g: int, left: Floats, weight: Floats, start: float) -> Iterator[Family]:
         search, group = self.search, self.search.groups[g]
-        precise = _Precision(search.unit, search.count, group.repeatability, weight)
+        rest = left if self.own is None else left - self.own.added.get(g, 0.0)
+        precise = _Precision(search.unit, search.count, _of_units(rest, search, group.repeatability), weight)
         pull, ones = precise.times(left), precise.times(np.ones_like(left))
         pull = pull - ones * self._mean_by_part(pull, ones)
         patterns = list(_patterns(group, search.runs, search.part))
+        if not search.several and group.group.kind is FigureKind.COEFFICIENTS:
+            patterns = [one for one in patterns if one[0] != SEVERAL]
         known = np.asarray((group.weight > 0).any(axis=1))
         pairs, between = search._same_unit, precise.between(search._same_unit)
         for sums in self.sums:
             allowed = self._allowed(sums, known)
             score = sums.by_cell(pull)
             information, taken = sums.by_cell(precise.diagonal), self._by_part(sums, ones, ones)
+            scatter = _LocalScatter(sums, left, weight, rest)
             for form in (Form.SHIFT, Form.DRIFT):
                 if form is Form.SHIFT:
                     s, h = sums.by_window(score), sums.by_window(information)
                     h = h + sums.pairs_by_window(pairs, between)
                     h = h - sum(sums.by_window(part) ** 2 / total for part, total in taken)
+                    spread = scatter.of_windows()
                     base = allowed
                 else:
                     s, h = sums.by_ramp(score), sums.by_ramp(information, 2)
                     h = h + sums.pairs_by_ramp(pairs, between)
                     h = h - sum(sums.by_ramp(part) ** 2 / total for part, total in taken)
+                    spread = scatter.of_ramps()
                     everything = allowed.max(axis=1)
                     base = (
                         self.grid.ramps[1]
@@ -644,12 +723,15 @@ class _Level:
                         + np.where(np.isfinite(everything), 0, -np.inf)[:, None]
                     )
                 h = np.maximum(h, 0.0)
+                s, h = s / spread, h / spread
                 prior = base + start + np.log(search.prior.forms[form]) - np.log(len(patterns))
                 for name, vectors, by_run, scale in patterns:
                     if by_run:
                         if form is Form.DRIFT:
                             continue
                         own_s, own_h = self._by_run(sums, precise, pull, ones, vectors)
+                        overall = spread.mean(axis=2, keepdims=True)
+                        own_s, own_h = own_s / overall, own_h / overall
                     elif len(vectors) == 1:
                         own_s, own_h = s @ vectors.T, h @ vectors.T**2
                     else:
@@ -820,23 +902,27 @@ class _Level:
     def _take_all_residuals(self, posterior: Posterior, added: dict[int, Floats], acts: float) -> None:
         """A pattern of residuals at a place is one effect, whatever else it looks like:
         all that the residuals do in that place and time is taken off with it."""
-        search = self.search
-        inside = np.zeros(len(search.runs))
-        for family, place, window, p in posterior.likely():
-            if family.group in search.of_residuals and family.form in (Form.SHIFT, Form.DRIFT):
-                inside += self._in_time(family, place, window) * p * acts
-        if not inside.any():
-            return
-        for g in search.of_residuals:
-            left, weight = self._left(g), search.groups[g].weight
-            # Least squares on the place, with a free mean, without outliers.
-            for _ in range(3):
-                total = np.maximum(weight.sum(axis=0), TINY)
-                about = inside[:, None] - (weight * inside[:, None]).sum(axis=0) / total
-                centred = left - (weight * left).sum(axis=0) / total
-                shift = (weight * about * centred).sum(axis=0) / np.maximum((weight * about**2).sum(axis=0), TINY)
-                weight = search.groups[g].weight * _t_weight(centred - about * shift)
-            added[g] = inside[:, None] * shift
+        of_residuals = self.search.of_residuals
+        likely = [
+            (p * acts, self._in_time(family, place, window))
+            for family, place, window, p in posterior.likely()
+            if family.group in of_residuals and family.form in (Form.SHIFT, Form.DRIFT)
+        ]
+        for g in of_residuals if likely else ():
+            left = self._left(g)
+            shifts = [p * inside[:, None] * self._shift_of_all(g, left, inside) for p, inside in likely]
+            added[g] = np.sum(shifts, axis=0)
+
+    def _shift_of_all(self, g: int, left: Floats, inside: Floats) -> Floats:
+        """(d,) least squares on a place (N,), with a free mean, without outliers."""
+        weight, shift = self.search.groups[g].weight, np.zeros(left.shape[1])
+        for _ in range(3):
+            total = np.maximum(weight.sum(axis=0), TINY)
+            about = inside[:, None] - (weight * inside[:, None]).sum(axis=0) / total
+            centred = left - (weight * left).sum(axis=0) / total
+            shift = (weight * about * centred).sum(axis=0) / np.maximum((weight * about**2).sum(axis=0), TINY)
+            weight = self.search.groups[g].weight * _t_weight(centred - about * shift)
+        return np.asarray(shift)
 
     def factor(self, family: Family, place: int, window: int) -> float:
         """The factor of more scatter: the median of the squares inside over that
@@ -861,15 +947,70 @@ class _Level:
         return np.asarray(inside * ((self.grid.cell >= first) & (self.grid.cell < end)))
 
 
+class _LocalScatter:
+    """Variance of runs over that of all, from 1 on: where they scatter more, a
+    difference is less certain (Welch 1947, Biometrika 34:28)."""
+
+    def __init__(self, sums: Sums, left: Floats, weight: Floats, rest: Floats) -> None:
+        """``left`` (N,d) with its ``weight`` (N,d), and the ``rest`` that all effects
+        leave."""
+        self.sums = sums
+        known = (weight > 0).astype(float)
+        moments = (known, weight, weight * left, weight * left**2)
+        self.cells = [sums.by_cell(moment) for moment in moments]
+        self.whole = [moment.sum(axis=0) for moment in moments]
+        centre = (weight * rest).sum(axis=0) / np.maximum(weight.sum(axis=0), TINY)
+        self.usual = (weight * (rest - centre) ** 2).sum(axis=0) / np.maximum(known.sum(axis=0), 1.0)
+
+    def _variance(self, n: Floats, weight: Floats, first: Floats, second: Floats) -> Floats:
+        return np.asarray((second - first**2 / np.maximum(weight, TINY)) / np.maximum(n * self.usual, TINY))
+
+    def of_windows(self) -> Floats:
+        """(n,w,d) of the difference between a place and time, and the rest."""
+        inside = [self.sums.by_window(cells) for cells in self.cells]
+        outside = [whole - own for whole, own in zip(self.whole, inside, strict=True)]
+        share = inside[0] / np.maximum(self.whole[0], 1.0)
+        both = self._variance(*inside) * (1 - share) + self._variance(*outside) * share
+        return np.asarray(np.maximum(both, 1.0))
+
+    def of_ramps(self) -> Floats:
+        """(n,k,d) about a straight line after each ramp's beginning."""
+        n, weight, first, second = (cells.sum(axis=1)[:, None] for cells in self.cells)
+        ramp, square, product = (
+            self.sums.by_ramp(self.cells[1]),
+            self.sums.by_ramp(self.cells[1], 2),
+            self.sums.by_ramp(self.cells[2]),
+        )
+        weight = np.maximum(weight, TINY)
+        along = (product - first * ramp / weight) ** 2 / np.maximum(square - ramp**2 / weight, TINY)
+        return np.maximum(self._variance(n, weight, first, second - along), 1.0)
+
+
 UNITS = 3.0
 """Different units in a place and time, and outside; a unit that is measured m times
 counts as one m-th."""
 
 
+def _of_units(left: Floats, search: Search, repeatability: Floats) -> Floats:
+    """(N,d) share of the variance that runs of a unit differ by: ``repeatability``
+    (d,), or what they do differ by where that is far more."""
+    out = np.tile(repeatability, (len(left), 1))
+    if (search.count > 1).any():
+        units = int(search.unit.max()) + 1
+        total, square = np.zeros((2, units, left.shape[1]))
+        np.add.at(total, search.unit, left)
+        mean = total[search.unit] / search.count[:, None]
+        np.add.at(square, search.unit, (left - mean) ** 2)
+        variance = (square[search.unit]) / np.maximum(search.count - 1, 1)[:, None]
+        out = np.where(variance > TAILS * out, np.clip(variance, out, 1.0), out)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class _Precision:
     """Runs of one unit share what is the unit's: with the share λ of ``repeatability``
-    (d,) their covariance is W^−½ ((1 − λ) 1 1ᵀ + λ I) W^−½, with ``weight`` W (N,d)."""
+    (N,d) their covariance is W^−½ ((1 − λ) 1 1ᵀ + λ I) W^−½, with ``weight`` W
+    (N,d)."""
 
     unit: Ints
     count: Ints
@@ -905,7 +1046,7 @@ class _Precision:
         # Of many runs only neighbours are listed: each stands for all of its pairs.
         stands_for = np.where(m <= LISTED_RUNS, 1.0, m / 2)[:, None]
         root = np.sqrt(self.weight[first] * self.weight[second])
-        return np.asarray(-2 * root * self._common[first] / self.repeatability * stands_for)
+        return np.asarray(-2 * root * self._common[first] / self.repeatability[first] * stands_for)
 
 
 def _patterns(group: Standardised, runs: Sequence[UnitRun], part: Ints) -> Iterator[tuple[str, Floats, bool, float]]:

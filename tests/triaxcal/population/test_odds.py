@@ -50,11 +50,13 @@ def test_effects_that_no_unit_has_become_unlikelier_and_never_impossible() -> No
     assert learned.effects[NAMES[3]].odds == LEAST
 
 
-def test_a_few_units_change_little_and_uncertain_names_nothing() -> None:
-    unit = SeenUnit({NAMES[0]: SeenEffect(None), NAMES[1]: SeenEffect(0.001)})
-    learned = learned_odds([unit] * 3)
-    assert learned.effects[NAMES[0]].odds == pytest.approx(CATALOGUE_ODDS)
-    assert CATALOGUE_ODDS / 2 < learned.effects[NAMES[1]].odds < CATALOGUE_ODDS
+def test_a_few_units_change_little_and_uncertain_names_count_less_than_certain_ones() -> None:
+    def with_first(p: float | None) -> LearnedOdds:
+        return learned_odds([SeenUnit({NAMES[0]: SeenEffect(p), NAMES[1]: SeenEffect(0.001)})] * 2)
+
+    uncertain, certain = with_first(None), with_first(0.995)
+    assert CATALOGUE_ODDS < uncertain.effects[NAMES[0]].odds < certain.effects[NAMES[0]].odds < 0.55
+    assert CATALOGUE_ODDS / 2 < certain.effects[NAMES[1]].odds < CATALOGUE_ODDS
 
 
 def test_names_that_exclude_each_other_share_their_units() -> None:
