@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,4 +16,5 @@ def test_the_documentation_has_every_constant_with_its_value() -> None:
     told = {}
     for names, values in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", PAGE.read_text(), re.MULTILINE):
         told |= dict(zip(re.findall(r"`(\w+)`", names), map(float, values.split(", ")), strict=True))
-    assert told == {field.name: float(getattr(Odds(), field.name)) for field in fields(Odds)}
+    constants = {field.name: getattr(Odds(), field.name) for field in fields(Odds)}
+    assert told == {name: value for name, value in constants.items() if not isinstance(value, Mapping)}
