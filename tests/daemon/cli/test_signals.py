@@ -105,7 +105,7 @@ def test_an_audit_that_is_stopped_says_how_far_it_came(tmp_path: Path, number: i
 from triaxcald.audit import many
 from triaxcald.cli.commands import main
 true = many.audit
-many.audit = lambda path: raise_signal({number:d}) if path.name == "strikes.mcap" else true(path)
+many.audit = lambda path, **more: raise_signal({number:d}) if path.name == "strikes.mcap" else true(path, **more)
 main(["audit", *sys.argv[1:]])
 """
     done = _python(code, *options, *(tmp_path / name for name in names))
