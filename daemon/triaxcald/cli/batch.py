@@ -44,7 +44,7 @@ STEM: Final = re.compile(r"(.+?)(?:\.mcap|\.segments\.json|\.csv|\.csv\.gz|\.txt
 BESIDE: Final = "beside"
 BESIDE_ENDINGS: Final = (".cal.json", ".calibration.json", ".certificate.json")
 """Ends of names of a calibration beside a recording; the first that is there counts."""
-FILES: Final = ("attitudes", "datasheet")
+FILES: Final = ("attitudes", "datasheet", "odds")
 """Options that name a file, which goes to the workers."""
 NOT_OF_THE_WORK: Final = (
     "command", "part", "run", "computes", "recordings", "output", "resume", "jobs", "scheduler", "memory", "to",

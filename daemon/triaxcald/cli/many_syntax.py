@@ -13,6 +13,7 @@ from triaxcald.cli.syntax import (
     add_json,
     add_measuring,
     add_moment,
+    add_odds,
     add_residual_limit,
     add_table,
     add_uncertainty,
@@ -107,6 +108,7 @@ def _batch(commands: Any) -> None:
     add_measuring(p)
     add_uncertainty(p)
     add_moment(p)
+    add_odds(p)
     add_residual_limit(p)
     add_table(p)
     p = _part(parts, "verify", "verify many recordings under a calibration", "--calibration beside")
