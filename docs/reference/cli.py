@@ -111,7 +111,7 @@ With `--segment-size` (default 256M) or `--segment-time` (default 1h) the record
     "keys list": """Those in the folder `keys`, and those of the trust file.""",
     "keys trust": """Enters the key into `trust.toml`, which is made with `since` if there is none. An audit then takes unsigned recordings for differences.""",  # noqa: E501
     "keys revoke": """Signatures of the key are trusted no more, but for those that a time stamp shows to be from before.""",  # noqa: E501
-    "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Document `triaxcal.recording/1`.""",  # noqa: E501
+    "log info": """Topics, phases, metadata, attachments, events, losses, and why it ended; also of a recording that was not finished, of [all frames of a bus](recording.md#all-frames-of-a-bus), and of segments. Of a long recording from its index. Document `triaxcal.recording/1`.""",  # noqa: E501
     "log recover": """Refuses (exit 3) if neither a whole message nor an attachment is left. [How](../how-to/replay-and-audit.md). Document `triaxcal.recovery/1`.""",  # noqa: E501
     "log delete": """Only recordings in the station's folder, and only of a station with a key. The tombstone is in the chain before anything is deleted.""",  # noqa: E501
     "log export": """A phase or stream without samples is an error (exit 2). The output must not exist.""",
