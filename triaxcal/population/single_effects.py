@@ -143,7 +143,7 @@ LARGEST_FACTOR = 30.0
 UNKNOWN_LIKELY, UNLISTED = 0.5, 0.05
 """Probability of an effect that is likely and not calibrated; and likelihood ratio of
 one that a run does not list."""
-SWEEPS, MORE_SWEEPS = 2, 10
+SWEEPS, MORE_SWEEPS = 1, 8
 """Passes over all single effects after a further one, and at most in the end: each
 changes them less, by half where two overlap in time."""
 SIMPLE = 4
@@ -164,8 +164,9 @@ class SingleEffect:
     scale: dict[int, tuple[Floats, Floats]]
     rate: dict[str, Floats]
     finer: tuple[float, ...] = ()
-    after: tuple[tuple[SingleEffect, ...], tuple[float, ...]] | None = None
-    """The effects, and the moments, that it was last found with."""
+    number: int = 0
+    after: tuple[tuple[int, ...], tuple[float, ...]] | None = None
+    """The numbers of the effects, and the moments, that it was last found with."""
     factor: float = 1.0
     factor_error: float = 0.0
     """Of more scatter, under the likeliest hypothesis, with its standard error."""
@@ -204,6 +205,7 @@ class Search:
         self.likelihood = _likelihoods(runs)
         self.effects: list[SingleEffect] = []
         self.nothing = 1.0
+        self._count = 0
         self.several = True
         """Whether several coefficients may shift together."""
         self._standardise({})
@@ -219,7 +221,7 @@ class Search:
         self.subjects: list[int | str] = [*range(len(self.groups)), *self.likelihood]
         self.of_residuals = {i for i, g in enumerate(self._raw) if g.kind in (FigureKind.CONVERTER, FigureKind.POSES)}
         """Groups that are two views of the same residuals."""
-        self._cache: dict[int | str, tuple[tuple[SingleEffect, ...], list[Family]]] = {}
+        self._cache: dict[int | str, tuple[tuple[int, ...], list[Family]]] = {}
 
     # The passes.
 
@@ -327,7 +329,7 @@ class Search:
         level = _Level(self, self.effects, grid)
         families: list[Family] = []
         for subject in self.subjects:
-            given = tuple(effect for effect in self.effects if effect.acts_on(subject))
+            given = tuple(effect.number for effect in self.effects if effect.acts_on(subject))
             known = self._cache.get(subject)
             if known is None or known[0] != given:
                 self._cache[subject] = known = given, list(level.of(subject))
@@ -339,7 +341,7 @@ class Search:
         finer = self._finer(effect)
         subjects = self._subjects_of(effect)
         others = [other for other in self.effects if other is not effect]
-        after = tuple(other for other in others if any(other.acts_on(s) for s in subjects)), finer
+        after = tuple(other.number for other in others if any(other.acts_on(s) for s in subjects)), finer
         if effect.after == after:  # nothing has changed for it
             return effect
         family, _, window = effect.posterior.best()
@@ -377,7 +379,13 @@ class Search:
             self.nothing = nothing
         if 1 - nothing < self.prior.reported:
             return None
-        return level.effect(Posterior(families, nothing, log_total, grid), finer)
+        # The others take much memory, and are of no account.
+        best = max(float(f.log.max()) for f in families)
+        families = [f for f in families if float(f.log.max()) > best - NEGLIGIBLE]
+        effect = level.effect(Posterior(families, nothing, log_total, grid), finer)
+        self._count += 1
+        effect.number = self._count
+        return effect
 
     # What is read off.
 
@@ -685,8 +693,22 @@ class _Level:
             *self._means(subject, left, weight, start),
             *self._scatter(subject, self._left(subject), start + np.log(prior.forms[Form.SCATTER])),
         ]
+        if subject in self.search.of_residuals:
+            families = [self._without_places_taken(family) for family in families]
         known = (self.search.groups[subject].weight > 0).any(axis=1).sum()
         yield from _with_spread_estimated(families, EFFICIENCY * float(known))
+
+    def _without_places_taken(self, family: Family) -> Family:
+        """A place has one pattern of residuals and one scatter of them: further ones
+        would be the rest of the first."""
+        log = family.log
+        for effect in self.given:
+            best, place, _ = effect.posterior.best()
+            alike = (best.form is Form.SCATTER) == (family.form is Form.SCATTER)
+            if best.group in self.search.of_residuals and alike and best.places is family.places:
+                log = log.copy()
+                log[place] = -np.inf
+        return replace(family, log=log)
 
     def _means(self, g: int, left: Floats, weight: Floats, start: float) -> Iterator[Family]:
         search, group = self.search, self.search.groups[g]
@@ -776,6 +798,8 @@ class _Level:
 
     def _scatter(self, g: int, left: Floats, start: float) -> Iterator[Family]:
         search, group = self.search, self.search.groups[g]
+        if group.group.kind is FigureKind.CONVERTER:  # the same residuals scatter by direction
+            return
         factors = np.array(search.prior.factors)
         alone = group.group.figures if group.group.alone else ()
         prior = start - np.log(max(len(alone) + (len(group.mix) > 1), 1))
