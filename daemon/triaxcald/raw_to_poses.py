@@ -148,8 +148,5 @@ def of_poses(poses: Sequence[tc.Pose], unit: str = "") -> list[str]:
     """What poses are to be blamed for, likewise."""
     said = [tc.text.quality_line(f, unit) for f in tc.poses.disturbances(poses)]
     if found := [p for p in poses if p.creep.any()]:
-        said.append(
-            f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s: the reading drifts "
-            "while the unit rests; wait longer after each turn"
-        )
+        said.append(f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s")
     return said
