@@ -60,7 +60,7 @@ def test_an_audit_gets_the_same_numbers_with_the_linear_algebra_of_another_proce
         text=True,
         check=False,
     )
-    assert all(line.startswith("auditing ") for line in done.stderr.splitlines()), done.stderr
+    assert all(line.lstrip().startswith("auditing") for line in done.stderr.splitlines()), done.stderr
     differences = [d for each in json.loads(done.stdout)["audits"] for d in each["differences"]]
     assert all(d.startswith("report.html: ") for d in differences), differences
 
