@@ -59,9 +59,9 @@ if TYPE_CHECKING:
         Source,
         gauge_study,
     )
+    from triaxcal.population.hypotheses import Form, PlacePrior
     from triaxcal.population.odds import LearnedEffect, LearnedOdds, SeenUnit, learned_odds
     from triaxcal.population.runs import PlaceKind, SeenEffect, SeenPoses, UnitRun
-    from triaxcal.population.single_effects import Form, PlacePrior
     from triaxcal.population.statements import (
         Change,
         Pattern,
@@ -125,7 +125,7 @@ _NAMES = {
     ),
     "odds": ("LearnedEffect", "LearnedOdds", "SeenUnit", "learned_odds"),
     "runs": ("PlaceKind", "SeenEffect", "SeenPoses", "UnitRun"),
-    "single_effects": ("Form", "PlacePrior"),
+    "hypotheses": ("Form", "PlacePrior"),
     "statements": ("Change", "Pattern", "Place", "PlacedEffects", "Statement", "Verdict", "placed_effects"),
 }
 

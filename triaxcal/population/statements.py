@@ -19,9 +19,10 @@ from typing import TypeVar
 
 from triaxcal.errors import InvalidData
 from triaxcal.population.figures import FigureKind
+from triaxcal.population.hypotheses import Family, Form, PlacePrior, Posterior, SingleEffect
 from triaxcal.population.places import FEWEST
 from triaxcal.population.runs import PlaceKind, UnitRun
-from triaxcal.population.single_effects import Family, Form, PlacePrior, Posterior, Search, SingleEffect
+from triaxcal.population.single_effects import Search
 
 
 @dataclass(frozen=True)

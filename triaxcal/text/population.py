@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 from triaxcal.number_format import plain
 from triaxcal.population.figures import FigureKind
+from triaxcal.population.hypotheses import COMMON_FACTOR, SEVERAL, THERMOMETER, Form
 from triaxcal.population.runs import PlaceKind
-from triaxcal.population.single_effects import COMMON_FACTOR, SEVERAL, THERMOMETER, Form
 from triaxcal.population.statements import Change, Pattern, Place, PlacedEffects, Statement, Verdict
 from triaxcal.text.advice import chance
 

@@ -8,7 +8,7 @@ import pytest
 
 from triaxcal.population import Change, Form, Pattern, Place, PlacedEffects, PlaceKind, Statement, Verdict
 from triaxcal.population.figures import FigureKind
-from triaxcal.population.single_effects import COMMON_FACTOR, SEVERAL, THERMOMETER
+from triaxcal.population.hypotheses import COMMON_FACTOR, SEVERAL, THERMOMETER
 from triaxcal.text.population import line, lines, pattern, place
 
 
