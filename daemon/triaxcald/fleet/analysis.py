@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
 
 import numpy as np
 
 import triaxcal as tc
+from triaxcald.fleet.places import Placed
 from triaxcald.fleet.reading import Row
-from triaxcald.fleet.values import COEFFICIENTS, LIMITS, Figure, Fleet
+from triaxcald.fleet.values import Figure, Fleet
+from triaxcald.service.quality import COEFFICIENTS, FIGURES
 
 CHARTED_LEAST: Final = 8
 """Units below which a moving range says too little of the scatter."""
@@ -31,25 +33,6 @@ SMALLEST_EFFECT: Final = 0.5
 PROBABILITY: Final = 0.05
 
 population = tc.population
-
-
-class Placed(Protocol):
-    """An effect of a place, as the loop one level up states it."""
-
-    @property
-    def kind(self) -> str: ...
-    @property
-    def place(self) -> str: ...
-    @property
-    def since(self) -> str | None: ...
-    @property
-    def figure(self) -> str: ...
-    @property
-    def probability(self) -> float: ...
-    @property
-    def size(self) -> str: ...
-    @property
-    def text(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -110,7 +93,7 @@ def _figure(fleet: Fleet, name: str, comparing: _Comparing, drift: Any | None) -
         "n": len(last),
         "distribution": _distribution(values, rows),
         "comparisons": comparing.documents(name),
-        "charts": _charts(values, rows, name in LIMITS),
+        "charts": _charts(values, rows, name in FIGURES),
         "capability": _capability(values, fleet.limit(name)),
         "gauge": _gauges(fleet, figure),
         "drift": None if drift is None else _drift_document(drift, _unit_of_drift(figure)),
@@ -450,5 +433,4 @@ def _new(fleet: Fleet, name: str) -> float:
 
 
 def _placed(value: Placed) -> dict[str, Any]:
-    keys = ("kind", "place", "since", "figure", "probability", "size", "text")
-    return {key: getattr(value, key) for key in keys} | {"probability": tc.rounding.chance(value.probability)}
+    return asdict(value) | {"probability": tc.rounding.chance(value.probability)}

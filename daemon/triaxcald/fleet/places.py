@@ -16,11 +16,11 @@ from triaxcald.errors import InputError
 from triaxcald.fleet.reading import Certified, Row
 from triaxcald.fleet.values import Fleet
 from triaxcald.inputs import DOCUMENT_MOST, parse_document
+from triaxcald.service.quality import COEFFICIENTS
 
 WHOLE_MOST: Final = 2000
 """Runs of which certificates are read whole, with their poses: more take minutes. Of
 larger fleets the coefficients and effects count, without poses."""
-COEFFICIENTS: Final = tuple(f"{kind}_{axis}" for kind in ("scale_factor", "misalignment", "bias") for axis in "xyz")
 FACTORS: Final = ("part_number", "batch", "station", "fixture", "slot", "operator")
 Tell = Callable[[int, int], None]
 

@@ -14,19 +14,9 @@ import numpy as np
 import triaxcal as tc
 from triaxcald.fleet.reading import Certified, Row, Runs
 from triaxcald.service.golden import is_check
+from triaxcald.service.quality import COEFFICIENTS, FIGURES, UNITS
 from triaxcald.work import plain_serial
 
-LIMITS: Final = {
-    "rms_g": "rms_limit_g",
-    "cross_validated_rms_g": "cross_validated_rms_limit_g",
-    "verification_rms_g": "verification_rms_limit_g",
-}
-"""Figures with an upper limit, and the column of the limit."""
-COEFFICIENTS: Final = {
-    f"{kind}_{axis}": unit
-    for kind, unit in (("scale_factor", "output/g"), ("misalignment", "rad"), ("bias", "g"))
-    for axis in "xyz"
-}
 UNCERTAINTIES: Final = {
     "uncertainty_this_fit_g": "this_fit",
     "uncertainty_another_day_g": "another_day",
@@ -87,7 +77,7 @@ class Fleet:
 
     def limit(self, figure: str) -> float | None:
         """Of the last run that has one."""
-        column = LIMITS.get(figure)
+        column = FIGURES.get(figure)
         return None if column is None else next((r[column] for r in reversed(self.rows) if r[column] is not None), None)
 
 
@@ -97,7 +87,7 @@ def fleets_of(runs: Runs) -> list[Fleet]:
     by_part: dict[str | None, list[Row]] = {}
     seen: set[str] = set()
     for row in runs.rows:
-        measured = any(row[name] is not None for name in (*LIMITS, *COEFFICIENTS))
+        measured = any(row[name] is not None for name in (*FIGURES, *COEFFICIENTS))
         if not row["tried"] or not measured or is_check(row) or row["run"] in seen:
             continue
         if row["run"] is not None:
@@ -135,7 +125,7 @@ def _fleet(part_number: str | None, rows: list[Row], certified: Mapping[str, Cer
 
 def _columns(rows: Sequence[Row]) -> list[Figure]:
     found = []
-    for name, unit in {**dict.fromkeys(LIMITS, "g"), **COEFFICIENTS}.items():
+    for name, unit in UNITS.items():
         values = _array(row[name] for row in rows)
         error = f"{name}_standard_error"
         errors = _array(row[error] for row in rows) if name in COEFFICIENTS else np.full(len(rows), np.nan)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,21 +11,11 @@ import pytest
 from tests.daemon.fleet.worlds import certificate, line, write
 from triaxcald.fleet import Asked, Selection, fleet_document, fleets_of, read_runs, render_fleet
 from triaxcald.fleet.page import drift_table, gauge_table, lasting, notices
+from triaxcald.fleet.places import Placed
 from triaxcald.schema.fleet import FleetDocument
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.slow
-
-
-@dataclass(frozen=True)
-class Placed:
-    kind: str
-    place: str
-    since: str | None
-    figure: str
-    probability: float
-    size: str
-    text: str
 
 
 PLACED = [
