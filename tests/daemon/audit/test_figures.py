@@ -181,9 +181,9 @@ def test_a_key_or_an_entry_more_or_less_is_found(figures: dict[str, Figures]) ->
     ("stored", "exact", "same"),
     [
         (1.235, 1.2345, True),  # on the edge
-        (1.234, 1.2345 + 4e-5, True),  # a little beyond
-        (1.234, 1.2345 + 6e-5, False),
-        (1.235, 1.2344, False),
+        (1.234, 1.2345 + 4e-4, True),  # by less than half a digit beyond
+        (1.234, 1.2345 + 6e-4, False),
+        (1.235, 1.2339, False),
         (1.2346, 1.2345, False),  # nobody prints that
         (1.234, 1.2336, True),
         (1.236, 1.2349, False),
