@@ -67,10 +67,12 @@ class Result(StrEnum):
 class Notes:
     """What an auditor should know and what is no difference. ``versions`` by
     name, then and now; ``not_beside`` are files that are not beside the
-    recording; ``report_as_listed`` where the report was not drawn again."""
+    recording; ``report_as_listed`` where the report was not drawn again, and
+    ``pictures_as_signed`` where only the lines in its pictures were not."""
 
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     report_as_listed: bool = False
+    pictures_as_signed: bool = False
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
@@ -158,7 +160,8 @@ class _Audit:
         self._outcome: Mapping[str, Any] = {}
         self._raw = digests(recording)
         self._mended = RECOVERY_RECORD in recording.metadata
-        self._listed_report = False
+        self._signed = False
+        self._listed_report = self._pictures_as_signed = False
         self._agreement = Agreement()
         self._furthest: tuple[float, str] | None = None
         by = {name: then for name, (then, _) in self._versions().items() if name in COMPUTES}
@@ -170,6 +173,8 @@ class _Audit:
             raise RecordingError(
                 f"{self._path}: attachment {ATTACHMENT}: missing; the recording holds no result to audit"
             )
+        signature, unproven = check_signature(self._path, self._held, found, self._policy)
+        self._signed = signature.state is State.TRUSTED
         again = self._again()
         self._check_outcome(found, again)
         if again is not None:
@@ -179,7 +184,6 @@ class _Audit:
         self._differences += contents.faults(found)
         if self._outcome:
             self._differences += contents.against_inventory(found, self._outcome)
-        signature, unproven = check_signature(self._path, self._held, found, self._policy)
         self._differences += unproven
         differing, not_beside = beside(self._path, self._held)
         self._differences += differing
@@ -371,8 +375,11 @@ class _Audit:
             self._listed_report = True
         elif ending is not None:
             self._checked.append(REPORT)
+            self._pictures_as_signed = self._signed
             try:
-                drawn = report_of(again, ending, held_in(self._outcome) or Held())
+                # A trusted station signed the lines in the pictures, which show the
+                # same figures as the words do.
+                drawn = report_of(again, ending, held_in(self._outcome) or Held(), pictures=not self._signed)
             except CANNOT as e:
                 self._add(REPORT, Kind.NOT_COMPUTED, again=str(e) or repr(e))
                 return
@@ -476,6 +483,7 @@ class _Audit:
         return Notes(
             versions=self._versions(),
             report_as_listed=self._listed_report,
+            pictures_as_signed=self._pictures_as_signed,
             losses=tuple(losses_of(self._recording)),
             mended=self._mended,
             not_beside=not_beside,

@@ -4,6 +4,7 @@ metadata: computed as the station did it."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +38,7 @@ from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.raw_to_poses import Pipeline
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import ODDS_FILE, RECOVERY_RECORD, SEALED_LATER, STATION_FILE, RawDigest
+from triaxcald.report.charts import undrawn
 from triaxcald.report.page import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.golden_unit import GoldenCheck
@@ -312,9 +314,11 @@ def has_codes(outcome: Mapping[str, Any]) -> bool:
     return "code" in outcome
 
 
-def report_of(again: Again, ending: Ending, held: Held) -> str:
+def report_of(again: Again, ending: Ending, held: Held, *, pictures: bool = True) -> str:
+    """The page, with or without lines in its pictures."""
     assert again.certified is not None
-    return unit_report(again.certified, again.readings, ending, again.verification if again.checked else None, held)
+    with nullcontext() if pictures else undrawn():
+        return unit_report(again.certified, again.readings, ending, again.verification if again.checked else None, held)
 
 
 def sealed_later(outcome: Mapping[str, Any], recording: Recording) -> bool:

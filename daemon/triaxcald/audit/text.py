@@ -137,6 +137,8 @@ def notes(of: Notes) -> list[str]:
         found.append("sentences, and keys that the earlier version did not write, are not compared")
     if of.report_as_listed:
         found.append("report.html was not drawn again, since versions differ; it is compared with the outcome's digest")
+    if of.pictures_as_signed:
+        found.append("the pictures in report.html are as a trusted key signed them; words and figures are compared")
     found += of.losses
     if of.mended:
         found.append("the recording was cut short or damaged, and mended")

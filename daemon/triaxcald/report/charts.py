@@ -7,6 +7,8 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -77,12 +79,28 @@ _STYLE = {
 _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
+_UNDRAWN: ContextVar[bool] = ContextVar("undrawn", default=False)
+
+
+@contextmanager
+def undrawn() -> Iterator[None]:
+    """Within it, `draw` returns the description of a picture and no lines, which
+    take most of the time of a page."""
+    before = _UNDRAWN.set(True)
+    try:
+        yield
+    finally:
+        _UNDRAWN.reset(before)
+
+
 def draw(name: str, alt: str, size_in: tuple[float, float], paint: Callable[[Figure], None]) -> Markup:
     """Inline SVG of what `paint` draws, `alt` read aloud in its place.
 
     The same drawing gives the same bytes; `name` keeps the ids of several
     drawings on a page apart.
     """
+    if _UNDRAWN.get():
+        return _inline("<svg></svg>", name, alt)
     with matplotlib.style.context(["default", {**_STYLE, "svg.hashsalt": name}]):
         figure = Figure(figsize=size_in, layout="constrained")
         paint(figure)
