@@ -1,10 +1,11 @@
 """Processor seconds of an audit, by part.
 
-    python -m benchmarks.audit_cost [FOLDER] [--units 4] [--poses 30]
+    python -m benchmarks.audit_cost [FOLDER] [--units 4] [--poses 30] [--signed]
 
 Audits the recordings of a folder one after the other in one process; without a folder, runs of simulated units with
 hidden effects on a virtual clock, on CAN and Modbus in turn. The first audit loads what the others use and is not
-counted. A part counts without the parts inside it.
+counted. A part counts without the parts inside it. ``--signed``: by a key that is trusted, so that the audit does not
+draw the pictures.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ PARTS: Sequence[tuple[str, Any, str]] = (
     ("previews", previews, "check"),
     ("poses and their noise", Pipeline, "finish"),
     ("diagnosis", tc.diagnosis, "diagnose"),
+    ("signature", conduct, "check_signature"),
     ("certificate", results, "certify"),
     ("pictures", charts, "draw"),
     ("pictures", over_time, "draw"),
@@ -89,7 +91,7 @@ bus = {bus}
 """
 
 
-def simulated(folder: Path, units: int, poses: int) -> None:
+def simulated(folder: Path, units: int, poses: int, *, signed: bool) -> None:
     """Runs of ``units`` with ``poses`` each, one folder a unit."""
     for unit in range(units):
         effect, values = list(EFFECTS.items())[unit % len(EFFECTS)]
@@ -101,6 +103,8 @@ def simulated(folder: Path, units: int, poses: int) -> None:
         (at / "device.toml").write_text(DEVICE.format(**filled, effect=named))
         (at / "station.toml").write_text(STATION.format(**filled))
         told = io.StringIO()
+        if signed:
+            keyed(at)
         with (
             virtual_line(described(at / "device.toml")),
             contextlib.redirect_stdout(told),
@@ -108,6 +112,17 @@ def simulated(folder: Path, units: int, poses: int) -> None:
         ):
             if triaxcal(["run", str(at / "station.toml")]):
                 sys.exit(f"unit {unit}: the run failed\n{told.getvalue()}")
+
+
+def keyed(folder: Path) -> None:
+    """A key without a passphrase, and a trust file that has it."""
+    from triaxcald.signing.keys import new_key, to_text
+    from triaxcald.signing.trust import FORMAT, NAME, TrustedKey, TrustFile, save
+
+    (folder / "keys").mkdir()
+    key, since = new_key(folder / "keys", "cost", None), "2020-01-01T00:00:00+00:00"
+    trusted = TrustedKey(name=key.name, public=to_text(key.public), since=since)
+    save(folder / NAME, TrustFile(format=FORMAT, since=since, keys=(trusted,)))
 
 
 @contextlib.contextmanager
@@ -177,10 +192,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--units", type=int, default=4)
     parser.add_argument("--poses", type=int, default=30)
+    parser.add_argument("--signed", action="store_true")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as made:
         if options.folder is None:
-            simulated(Path(made), options.units, options.poses)
+            simulated(Path(made), options.units, options.poses, signed=options.signed)
         print(cost(sorted((options.folder or Path(made)).rglob("*.mcap"))))
     return 0
 
