@@ -1,5 +1,5 @@
 """Which errors say that memory ran out, whoever raises them; and less garbage
-collection for services, which give freed memory back."""
+collection for services; freed memory goes back to the system."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import mmap
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Final
 
 _LIBRARY_SAYS = ("failed to map segment", "cannot allocate memory", "unable to allocate")
 """What the loader of shared libraries says in an ImportError (glibc, musl)."""
@@ -182,12 +183,30 @@ def little_garbage() -> Iterator[None]:
         gc.unfreeze()
 
 
+_MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of malloc.h
+LARGE_BYTES: Final = 4 * 2**20
+"""Arrays of a recording of half a day. Smaller blocks are so frequent that handing each
+to the system takes noticeable time."""
+
+
+def large_apart() -> None:
+    """From now on blocks of `LARGE_BYTES` or more go back to the system once freed. By
+    itself glibc raises that size up to 32 MiB as blocks are freed, and arrays of long
+    recordings leave holes between others. Another C library keeps its own rule."""
+    _of_c_library("mallopt", _MMAP_THRESHOLD, LARGE_BYTES)
+
+
 def give_back() -> None:
     """Collect cycles, and give freed memory back to the system: the C library keeps
     what lies between blocks in use. Takes some tens of milliseconds."""
     gc.collect()
+    _of_c_library("malloc_trim", 0)
+
+
+def _of_c_library(name: str, *arguments: int) -> None:
+    """Call a function of glibc, where it is the C library."""
     try:
-        trim = ctypes.CDLL(None).malloc_trim
+        function = getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):  # another C library, Windows
         return
-    trim(0)
+    function(*arguments)

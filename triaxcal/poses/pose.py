@@ -44,17 +44,19 @@ def _course(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, Channe
     begin, end = int(w.start_ns[s.first]), int(w.end_ns[s.last])
     half = (end - begin) // 2
     first, last = np.searchsorted(w.start_ns, [begin - half, end + half])
-    # Least-squares parabola in time, scaled to the span.
-    t_s = (w.start_ns[first:last] + w.period_ns / 2 - (begin + end) / 2) * 1e-9
+    # Least-squares parabola in time, scaled to the span, by its normal equations: a
+    # span may last for days. Its three columns are far from parallel.
     scale = max((end - begin) * 1e-9, 1e-9)
-    powers = np.vander(t_s / scale, 3, increasing=True)
-    gain = np.linalg.pinv(powers)
-    spread = np.sqrt((gain**2).sum(axis=1))
+    t = (w.start_ns[first:last] + w.period_ns / 2 - (begin + end) / 2) * (1e-9 / scale)
+    sums = [float(np.sum(t**k)) for k in range(5)]
+    inverse = np.linalg.pinv(np.array([sums[k : k + 3] for k in range(3)]), rcond=1e-12)
+    spread = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     out = {}
     for name, channel in w.channels.items():
         values = channel[first:last] - channel[first:last].mean()
-        middle, rate, bend = gain @ values
-        scatter = float(np.sqrt(np.sum((values - powers @ [middle, rate, bend]) ** 2) / max(len(t_s) - 3, 1)))
+        middle, rate, bend = inverse @ [values.sum(), t @ values, t**2 @ values]
+        values -= middle + t * (rate + t * bend)
+        scatter = float(np.sqrt(values @ values / max(len(t) - 3, 1)))
         # A step of a coarse thermometer adds an error of the order of its slope.
         step = steps[name]
         out[name] = ChannelCourse(

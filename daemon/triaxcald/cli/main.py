@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from triaxcald.abort import ignore_stop_signals
 from triaxcald.cli.signals import heed_stop_signals
-from triaxcald.memory import out_of_memory, ran_out_of_memory
+from triaxcald.memory import large_apart, out_of_memory, ran_out_of_memory
 from triaxcald.printable import printable
 
 LAST_THREADS_S = 1.0
@@ -23,6 +23,7 @@ def entry() -> NoReturn:
     _open_what_is_closed()
     heed_stop_signals()
     _keep_from_python_can()
+    large_apart()
     gc.disable()  # until the command has what it works with: modules are no garbage
     try:
         from triaxcald.cli.commands import main

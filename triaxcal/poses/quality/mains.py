@@ -29,9 +29,10 @@ SEGMENT_S = 1.0
 shorter ones do not separate a line from the noise next to it."""
 SEGMENT_LEAST = 16
 """Least samples in a segment at low rates; so few bins have no room for a band."""
-SEGMENTS_MOST = 2**15
-"""Number of segments that are kept, of four and a half hours: at 1 kHz they take 60
-MB. Of a longer stream every second one is kept, every fourth, and so on."""
+SEGMENTS_MOST = 2**13
+"""Number of segments that are kept, of 1.1 hours: at 1 kHz they take 15 MB. Of a
+longer stream every second one is kept, every fourth, and so on. Four times as many
+would show lines 0.7 times as high, which are far below the noise of a sample."""
 SEGMENTS_LEAST = 8
 """Segments of still poses below which their mean spectrum is too uncertain."""
 GAP = 4.0

@@ -447,14 +447,14 @@ def _moved(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
             out |= np.abs(difference) > STEP_SIGMA * sigma[axis]
         return np.asarray(at[out])
     # Subtract the common climb of the run: steady creep is no move.
-    differences = contrast(w.mean, at, scale, scale)
     size = np.zeros(len(at))
     for axis in range(3):
-        np.maximum(size, np.abs(differences[:, axis] / sigma[axis]), out=size)
+        np.maximum(size, np.abs(contrast(w.mean[:, axis : axis + 1], at, scale, scale)[:, 0] / sigma[axis]), out=size)
     quiet = _Quietest.of(at, size)
-    for axis in range(3):
-        climb = quiet.common_climb(differences[:, axis] / sigma[axis])
-        out |= np.abs(differences[:, axis] - climb * sigma[axis]) > MOVE_SIGMA * sigma[axis]
+    for axis in range(3):  # once more, which takes less than to keep three
+        differences = contrast(w.mean[:, axis : axis + 1], at, scale, scale)[:, 0]
+        climb = quiet.common_climb(differences / sigma[axis])
+        out |= np.abs(differences - climb * sigma[axis]) > MOVE_SIGMA * sigma[axis]
     return np.asarray(at[out])
 
 
