@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import triaxcal as tc
-from tests.population.worlds import KINDS, YEAR_S, World, judged, world
+from tests.population.worlds import KINDS, YEAR_S, World, judged, with_broken_end, world
 from triaxcal.population import Form, PlacedEffects, PlaceKind, UnitRun, Verdict, placed_effects
 
 SMALL = 150
@@ -99,6 +99,11 @@ def test_a_broken_unit_and_a_unit_that_is_measured_often_are_no_effect_of_a_plac
     rng = np.random.default_rng(5)
     golden = [replace(g, coefficients=g.coefficients + rng.normal(size=9) * 1e-5) for g in golden]
     assert placed_effects([*runs, *golden]).statements == ()
+
+
+@pytest.mark.parametrize("seed", range(70, 78))
+def test_a_broken_unit_among_the_last_runs_is_no_drift_of_a_place(seed: int) -> None:
+    assert placed_effects(with_broken_end(small(seed, 0), seed).runs).statements == ()
 
 
 def test_repeated_units_tell_a_small_shift_that_different_units_hide() -> None:
