@@ -258,6 +258,10 @@ class Product(tc.schema.Model):
     units: Annotated[int, Field(description="number of units, by serial number")]
     runs: Annotated[int, Field(description="number of runs that measured something")]
     repeated: Annotated[int, Field(description="number of units with two runs or more")]
+    left_out: Annotated[
+        int,
+        Field(description="number of their runs that failed or were aborted: not in gauge studies and drifts"),
+    ]
     first: Annotated[str, Field(description="end of the first run, UTC")]
     last: Annotated[str, Field(description="end of the last run, UTC")]
     factors: Annotated[dict[str, int], Field(description="number of groups, by factor")]

@@ -148,6 +148,40 @@ def test_a_gauge_study_by_fixture_finds_its_size(product: dict[str, Any]) -> Non
     assert figure(product, "bias_x")["gauge"][0]["grr"] < 0.03
 
 
+@pytest.mark.parametrize("verdict", ["aborted", "fail"])
+def test_a_run_that_failed_is_in_no_gauge_study_and_no_drift(tmp_path: Path, verdict: str) -> None:
+    documents = line(40, repeats=4, shift=0.0)
+    clean = document_of(write(tmp_path / "clean", documents), Asked(limit_g=0.02))["products"][0]
+    mine = [d for d in documents if d["serial"] == "5000"]
+    last = json.loads(json.dumps(mine[-1]))
+    last |= {"verdict": verdict, "code": "implausible", "run": "another", "ended": "2027-01-30T08:00:00.000+00:00"}
+    last["measured"]["calibration"]["bias"][0] += 0.5
+    of = document_of(write(tmp_path / "with", [*documents, last]), Asked(limit_g=0.02))["products"][0]
+    assert (clean["left_out"], of["left_out"]) == (0, 1)
+    for key in ("gauge", "drift"):
+        assert figure(of, "bias_x")[key] == figure(clean, "bias_x")[key]
+    assert of["recalibration"] == clean["recalibration"]
+    # The coefficients of a failed unit are its own; of a stopped run nobody knows what was measured.
+    same = figure(of, "bias_x")["distribution"] == figure(clean, "bias_x")["distribution"]
+    assert same == (verdict == "aborted")
+
+
+def test_an_aborted_run_stands_for_a_unit_without_another(tmp_path: Path) -> None:
+    alone = outcome("1", 0, FIGURES) | {"verdict": "aborted", "code": "implausible"}
+    (of,) = document_of(write(tmp_path, [alone, outcome("2", 1, FIGURES)]))["products"]
+    assert figure(of, "bias_x")["n"] == 2
+
+
+def test_of_a_unit_with_many_runs_a_gauge_study_takes_pairs(tmp_path: Path) -> None:
+    documents = line(6, repeats=70, repeated=6, shift=0.0)
+    (of,) = document_of(write(tmp_path, documents), Asked(limit_g=0.02))["products"]
+    assert of["runs"] == 420
+    (study,) = [study for study in figure(of, "bias_x")["gauge"] if study["factor"] is None]
+    assert 6 * 40 < study["measurements"] <= 6 * 50
+    assert study["components"]["repeatability"]["sd"] == pytest.approx(3e-5, rel=0.2)
+    assert figure(of, "bias_x")["drift"]["span_days"] > 1000
+
+
 def test_charts_state_their_run_lengths(product: dict[str, Any]) -> None:
     charts = figure(product, "bias_x")["charts"]
     assert charts["individuals"]["run_length"] == pytest.approx(152.7, abs=0.1)
