@@ -82,7 +82,7 @@ def _reading(done: int, of: int) -> None:
 
 
 def _show(document: dict[str, Any]) -> None:
-    from triaxcald.fleet.page import differing, mean_of, notices, percent, roughly, title_of
+    from triaxcald.fleet.page import differing, mean_of, notices, percent, roughly, title_of, worst_study
 
     for product in document["products"]:
         part = product["part_number"]
@@ -95,12 +95,12 @@ def _show(document: dict[str, Any]) -> None:
             [
                 title_of(f["name"]), str(f["n"]), mean_of(f), roughly(f["distribution"]["sd"], f["unit"]),
                 "—" if f["charts"] is None else str(f["charts"]["cusum"]["count"]),
-                percent(next((study["grr"] for study in f["gauge"]), None)), differing(f),
+                percent((worst_study(f) or {}).get("grr")), differing(f),
             ]
             for f in figures
         ]  # fmt: skip
         head = ["figure", "units", "mean", "sd", "CUSUM", "%GRR", "differs by"]
-        table("one value a unit; signals of the CUSUM; repeatability of units that repeat", head, rows)
+        table("one value a unit; signals of the CUSUM; %GRR by the factor that matters most", head, rows)
         for text in notices(product):
             show(f"* {text}")
         if (interval := product["recalibration"]) is not None:

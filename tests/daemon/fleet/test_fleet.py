@@ -17,6 +17,7 @@ from triaxcald.cli.commands import main
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError
 from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
+from triaxcald.fleet.page import last_move, notices, percent, worst_study
 from triaxcald.fleet.reading import certified_in
 from triaxcald.recording.reader import Recording
 from triaxcald.schema.fleet import FleetDocument
@@ -180,6 +181,45 @@ def test_of_a_unit_with_many_runs_a_gauge_study_takes_pairs(tmp_path: Path) -> N
     assert 6 * 40 < study["measurements"] <= 6 * 50
     assert study["components"]["repeatability"]["sd"] == pytest.approx(3e-5, rel=0.2)
     assert figure(of, "bias_x")["drift"]["span_days"] > 1000
+
+
+def test_a_group_that_was_not_compared_is_not_the_farthest(tmp_path: Path) -> None:
+    documents = line()
+    odd = json.loads(json.dumps(documents[-1]))
+    odd |= {"serial": "9", "run": "odd"}
+    odd["work"] |= {"serial": "9", "fixture": "F9"}
+    odd["measured"]["calibration"]["bias"][1] += 0.5
+    (of,) = document_of(write(tmp_path, [*documents, odd]))["products"]
+    by = next(c for c in figure(of, "bias_y")["comparisons"] if c["factor"] == "fixture")
+    assert max(by["groups"], key=lambda g: abs(g["apart"]))["name"] == "F9"
+    assert any("Bias y differs by fixture, most at F2" in text for text in notices(of))
+
+
+def test_a_mean_is_said_to_move_only_where_more_signals_come_than_by_chance(tmp_path: Path) -> None:
+    documents = line(200, repeated=0, shift=0.0)
+    few = document_of(write(tmp_path / "few", documents))["products"][0]
+    charts = [f["charts"] for f in few["figures"] if f["charts"] and f["charts"]["cusum"]["count"]]
+    assert charts
+    assert [last_move(c) for c in charts] == [None] * len(charts)
+    for d in documents[100:]:
+        d["measured"]["calibration"]["bias"][0] += 0.02
+    (moved,) = document_of(write(tmp_path / "moved", documents))["products"]
+    last = last_move(figure(moved, "bias_x")["charts"])
+    assert last is not None
+    assert any(f"the mean last moved about {last['time'][:10]}" in text for text in notices(moved))
+
+
+def test_the_console_has_the_gauge_figure_of_the_page(
+    lined: Path, product: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    of = figure(product, "bias_y")
+    alone, worst = of["gauge"][0]["grr"], worst_study(of)
+    assert worst is not None
+    assert worst["grr"] != alone
+    assert main(["fleet", str(lined), "--limit", "0.02"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any("Bias y" in text and "fixture" in text and percent(worst["grr"]) in text for text in lines)
+    assert not any("Bias y" in text and percent(alone) in text for text in lines)
 
 
 def test_charts_state_their_run_lengths(product: dict[str, Any]) -> None:
