@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from typing import Any
-from urllib.parse import urlsplit
 
 import triaxcal as tc
 from triaxcald.cli.console import at, emit, erased, say, show, table
@@ -67,13 +66,12 @@ def fleet_command(a: argparse.Namespace) -> int:
 
 
 def _shown(source: str) -> str:
-    """Without the password of a database."""
-    if "://" not in source:
+    """A database without its password, and without options, which may hold one."""
+    if "://" not in source or source.startswith("sqlite:"):
         return source
-    parts = urlsplit(source)
-    user = f"{parts.username}@" if parts.username else ""
-    port = f":{parts.port}" if parts.port else ""
-    return f"{parts.scheme}://{user}{parts.hostname or ''}{port}{parts.path}"
+    from sqlalchemy import make_url
+
+    return make_url(source).set(query={}).render_as_string(hide_password=True)
 
 
 def _reading(done: int, of: int) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from tests.daemon.fleet.worlds import certificate, line, outcome, write
 from triaxcald.cli.commands import main
+from triaxcald.cli.fleet import _shown
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError
 from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
@@ -89,6 +90,13 @@ def test_runs_are_chosen_by_time_and_place(lined: Path) -> None:
     assert document_of(lined, equal={"serial": "5003"})["runs"] == 3
 
 
+@pytest.mark.parametrize("asked", ["5003", "005003"])
+def test_a_serial_number_is_one_with_and_without_leading_zeros(tmp_path: Path, asked: str) -> None:
+    write(tmp_path, [outcome(serial, day, FIGURES) for day, serial in enumerate(("5003", "005003", "50030"))])
+    found = document_of(tmp_path, equal={"serial": asked})
+    assert (found["units"], found["runs"]) == (1, 2)
+
+
 def test_runs_that_measured_nothing_and_copies_do_not_count(tmp_path: Path) -> None:
     one = outcome("1", 0, FIGURES)
     aborted = outcome("2", 1, FIGURES) | {"verdict": "aborted", "code": "no_poses", "measured": None}
@@ -119,10 +127,15 @@ def test_a_certificate_is_cut_out_as_it_would_be_parsed() -> None:
         certified_in("{}")
 
 
-def test_a_damaged_certificate_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "damaged",
+    ["{", '{\n  "result": {\n    "findings": ' + "[" * 200_000, '{"result": ' * 200_000],
+    ids=["cut", "part", "whole"],
+)
+def test_a_damaged_certificate_is_named(tmp_path: Path, damaged: str) -> None:
     write(tmp_path, [outcome("1", 0, FIGURES), outcome("2", 1, FIGURES)], [certificate(0.5)] * 2)
     broken = sorted(tmp_path.glob("*.certificate.json"))[0]
-    broken.write_text("{")
+    broken.write_text(damaged)
     assert document_of(tmp_path)["skipped"] == [broken.name]
 
 
@@ -338,6 +351,23 @@ def test_the_command_tells_what_stands_out(lined: Path, tmp_path: Path, capsys: 
 )
 def test_wrong_options_are_refused(lined: Path, wrong: list[str]) -> None:
     assert main(["fleet", str(lined), *wrong]) == 2
+
+
+@pytest.mark.parametrize(
+    "url", ["postgresql://u:hidden@h:abc/x", "postgresql://u:hidden@[::1/x", "mysql://u:hidden@h/x", "no url://hidden"]
+)
+def test_a_wrong_address_of_a_database_is_bad_input(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fleet", url]) == 2
+    told = capsys.readouterr().err
+    assert "the database: expected" in told
+    assert "hidden" not in told
+
+
+def test_a_database_is_shown_without_its_password() -> None:
+    shown = _shown("postgresql://u:hidden@[::1]:5432/line?password=hidden&sslmode=require")
+    assert (shown, _shown("sqlite:///a?b"), _shown("folder")) == (
+        "postgresql://u:***@[::1]:5432/line", "sqlite:///a?b", "folder",
+    )  # fmt: skip
 
 
 def test_an_empty_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
