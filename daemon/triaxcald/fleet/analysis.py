@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -86,7 +86,7 @@ def _product(fleet: Fleet, asked: Asked, placed: Sequence[Placed]) -> dict[str, 
         "figures": [_figure(fleet, name, comparing, drifts.get(name)) for name in fleet.figures if comparing.n(name)],
         "effects": _effects(fleet, comparing),
         "recalibration": _recalibration(fleet, drifts, asked),
-        "places": [_placed(value) for value in sorted(placed, key=lambda value: -value.probability)],
+        "places": [value.document for value in sorted(placed, key=lambda value: -value.probability)],
     }
 
 
@@ -446,7 +446,3 @@ def _new(fleet: Fleet, name: str) -> float:
         return 0.0
     scale = abs(float(np.nanmedian(figure.values))) if name.startswith("scale_factor") else 1.0
     return float(np.median(stated)) / (scale or 1.0)
-
-
-def _placed(value: Placed) -> dict[str, Any]:
-    return asdict(value) | {"probability": tc.rounding.chance(value.probability)}

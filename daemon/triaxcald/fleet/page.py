@@ -178,6 +178,36 @@ def _gauges(product: Mapping[str, Any]) -> Iterator[str]:
             yield f"{title_of(figure['name'])}: %GRR {percent(worst['grr'])}{by} (above 30 %: not acceptable, AIAG)."
 
 
+# Effects of places.
+
+
+def place_words(place: Mapping[str, Any]) -> str:
+    """ "fixture F2"; "hours 14-18 UTC"."""
+    kind = tc.population.PlaceKind(place["kind"])
+    return tc.text.population.place(tc.population.Place(kind, place["name"]))
+
+
+def where(value: Mapping[str, Any]) -> str:
+    """All places that it may be of."""
+    text = " or ".join(map(place_words, value["places"]))
+    return text[:1].upper() + text[1:]
+
+
+def acting(value: Mapping[str, Any]) -> str:
+    """The time in which it acts."""
+    interval = value["since_interval"]
+    began = f" (95 %: {interval[0]} to {interval[1]})" if interval and interval[0] != interval[1] else ""
+    match value["since"], value["until"]:
+        case None, None:
+            return "always"
+        case None, until:
+            return f"until {until}"
+        case since, None:
+            return f"since {since}{began}"
+        case since, until:
+            return f"from {since}{began} until {until}"
+
+
 # How the page writes figures.
 
 
@@ -307,10 +337,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "between": between, "chance": figures.chance, "concise": concise, "differing": differing, "digits": digits,
+        "acting": acting, "between": between, "chance": figures.chance, "concise": concise, "differing": differing,
+        "digits": digits,
         "drift_table": drift_table, "effect_title": tc.text.traces.effect_title, "gauge_table": gauge_table,
         "last_move": last_move, "lasting": lasting, "mean_of": mean_of,
         "p_value": figures.p_value, "percent": percent, "percents": percents,
+        "place_words": place_words, "where": where,
         "roughly": roughly, "title_of": title_of,
     }  # fmt: skip
     environment.tests["differing"] = differs

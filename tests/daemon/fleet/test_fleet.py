@@ -388,6 +388,8 @@ def test_a_fixture_that_shifts_a_bias_is_named(tmp_path: Path, capsys: pytest.Ca
         "fixture", "F2", None, "a shift of bias.y",
     )  # fmt: skip
     assert place["probability"] > 0.99
+    assert (place["verdict"], place["until"], place["since_interval"]) == ("named", None, None)
+    assert [(p["kind"], p["name"]) for p in place["places"]] == [("fixture", "F2")]
     assert place["text"] in page.read_text(encoding="utf-8")
 
 
