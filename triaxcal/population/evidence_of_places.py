@@ -93,8 +93,8 @@ class Level:
         least = np.array([FEWEST, UNITS])
         carried = sums.by_ramp(cells) ** 2 / np.maximum(sums.by_ramp(cells, 2), TINY)
         enough = (sums.after_begin(cells) >= least).all(axis=-1) & (carried >= least).all(axis=-1)
-        enough &= np.isfinite(allowed).any(axis=1)[:, None]
-        return np.where(enough, self.grid.ramps[1] - np.log(len(sums.places.names)), -np.inf)
+        some = np.asarray(np.isfinite(allowed).any(axis=1, keepdims=True))
+        return np.where(enough & some, self.grid.ramps[1] - np.log(len(sums.places.names)), -np.inf)
 
     # The data of one group, given the other effects.
 

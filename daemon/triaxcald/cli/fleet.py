@@ -66,12 +66,12 @@ def fleet_command(a: argparse.Namespace) -> int:
 
 
 def _shown(source: str) -> str:
-    """A database without its password, and without options, which may hold one."""
+    """A database without its password."""
     if "://" not in source or source.startswith("sqlite:"):
         return source
-    from sqlalchemy import make_url
+    from triaxcald.service.database import shown_address
 
-    return make_url(source).set(query={}).render_as_string(hide_password=True)
+    return shown_address(source)
 
 
 def _reading(done: int, of: int) -> None:
@@ -83,10 +83,11 @@ def _show(document: dict[str, Any]) -> None:
     from triaxcald.fleet.page import differing, mean_of, notices, percent, roughly, title_of, worst_study
 
     for product in document["products"]:
-        part = product["part_number"]
+        part, failed = product["part_number"], product["left_out"]
+        without = f", without {tc.number_format.number_of(failed, 'run')} that failed or were stopped" if failed else ""
         show(
             f"{f'part number {part}: ' if part else ''}{tc.number_format.number_of(product['units'], 'unit')} in "
-            f"{tc.number_format.number_of(product['runs'], 'run')}, {product['repeated']} measured more than once"
+            f"{tc.number_format.number_of(product['runs'], 'run')}, {product['repeated']} measured more than once{without}"
         )
         figures: Sequence[dict[str, Any]] = product["figures"][:SHOWN_MOST]
         rows = [

@@ -317,7 +317,7 @@ def _repeated(fleet: Fleet, values: tc.Floats) -> tc.Ints:
 def _thinned(rows: tc.Ints) -> tc.Ints:
     """Of one unit's runs, by time: evenly spread pairs of successive ones."""
     first = np.linspace(0, len(rows) - 2, PAIRS_MOST).astype(np.int64)
-    return rows[np.unique(np.concatenate([first, first + 1]))]
+    return np.asarray(rows[np.unique(np.concatenate([first, first + 1]))])
 
 
 def _gauges(fleet: Fleet, figure: Figure) -> list[dict[str, Any]]:

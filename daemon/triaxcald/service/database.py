@@ -136,6 +136,12 @@ def postgresql_engine(url: str, named: str = "--database") -> Engine:
         raise InputError(f"{named}: pip install 'triaxcal[postgres]' brings what speaks to PostgreSQL") from e
 
 
+def shown_address(url: str) -> str:
+    """Of an engine's URL: without its password, and without options, which may hold
+    one."""
+    return make_url(url).set(query={}).render_as_string(hide_password=True)
+
+
 def migrate(engine: Engine) -> None:
     """Bring the tables to the present version. Raises InputError for those of a later
     one, DatabaseError."""
