@@ -87,7 +87,8 @@ def _show(document: dict[str, Any]) -> None:
         without = f", without {tc.number_format.number_of(failed, 'run')} that failed or were stopped" if failed else ""
         show(
             f"{f'part number {part}: ' if part else ''}{tc.number_format.number_of(product['units'], 'unit')} in "
-            f"{tc.number_format.number_of(product['runs'], 'run')}, {product['repeated']} measured more than once{without}"
+            f"{tc.number_format.number_of(product['runs'], 'run')}, {product['repeated']} measured more than once"
+            f"{without}"
         )
         figures: Sequence[dict[str, Any]] = product["figures"][:SHOWN_MOST]
         rows = [
