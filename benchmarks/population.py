@@ -13,16 +13,17 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 import triaxcal as tc
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
-from tests.population.worlds import World, judged, world
+from tests.population.worlds import World, judged, with_broken_end, world
 from tests.undeclared import invented, invented_later, uncatalogued
 from tests.undeclared.examine import still_poses
 from tests.undeclared.generator import CannotShow, recording
@@ -50,6 +51,10 @@ def of_world(seed: int, effects: int, units: int = UNITS) -> Line:
     return _line(seed, world(seed, effects, units))
 
 
+def of_broken_end(seed: int) -> Line:
+    return _line(seed, with_broken_end(world(seed, 0, UNITS), seed))
+
+
 def _line(seed: int, made: World) -> Line:
     begin = time.process_time()
     found = tc.population.placed_effects(made.runs)
@@ -69,16 +74,16 @@ def _line(seed: int, made: World) -> Line:
     )  # fmt: skip
 
 
-def worlds(first: int, count: int, effects: int, jobs: int) -> list[Line]:
+def worlds(first: int, count: int, jobs: int, of: Callable[[int], Line]) -> list[Line]:
     with ProcessPoolExecutor(jobs, initializer=one_thread) as pool:
         lines = []
-        for line in pool.map(of_world, range(first, first + count), [effects] * count):
+        for line in pool.map(of, range(first, first + count)):
             print(line, file=sys.stderr, flush=True)
             lines.append(line)
     return lines
 
 
-def table(lines: Sequence[Line], empty: Sequence[Line]) -> Table:
+def table(lines: Sequence[Line], empty: Sequence[Line], broken: Sequence[Line] = ()) -> Table:
     def share(of: Sequence[bool]) -> str:
         return f"{sum(of)} of {len(of)}"
 
@@ -92,9 +97,11 @@ def table(lines: Sequence[Line], empty: Sequence[Line]) -> Table:
     days = [abs(d) for line in lines for d in line.days]
     rows.append(["statements of other places", str(sum(len(line.wrong) for line in lines)), "", ""])
     rows.append(["median days off a change", f"{np.median(days):.1f}" if days else "", "", ""])
-    seconds = [line.seconds for line in (*lines, *empty)] or [0.0]
+    seconds = [line.seconds for line in (*lines, *empty, *broken)] or [0.0]
     rows.append(["seconds a world, median and most", f"{np.median(seconds):.1f}", f"{max(seconds):.1f}", ""])
     rows.append(["empty worlds with anything named", share([bool(line.wrong) for line in empty]), "", ""])
+    if broken:
+        rows.append(["the same with a broken unit at the end", share([bool(line.wrong) for line in broken]), "", ""])
     return Table("Effects of places", ("effect", "place named alone", "named or listed", "pattern too"), rows)
 
 
@@ -211,14 +218,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=0, metavar="N")
     parser.add_argument("--empty", type=int, default=0, metavar="N")
+    parser.add_argument("--broken", type=int, default=0, metavar="N", help="without effects, a broken unit last")
     parser.add_argument("--full", type=int, default=0, metavar="N")
     parser.add_argument("--odds", type=int, default=0, metavar="UNITS", help="of each type, after those learned from")
     parser.add_argument("--units", type=int, default=UNITS)
     parser.add_argument("--first", type=int, default=TEST, metavar="SEED")
     parser.add_argument("--jobs", type=int, default=1)
     a = parser.parse_args(arguments)
-    if a.worlds or a.empty:
-        print(table(worlds(a.first, a.worlds, 2, a.jobs), worlds(a.first + 10_000, a.empty, 0, a.jobs)))
+    if a.worlds or a.empty or a.broken:
+        two, none = partial(of_world, effects=2), partial(of_world, effects=0)
+        print(
+            table(
+                worlds(a.first, a.worlds, a.jobs, two),
+                worlds(a.first + 10_000, a.empty, a.jobs, none),
+                worlds(a.first + 30_000, a.broken, a.jobs, of_broken_end),
+            )
+        )
     for k in range(a.full):
         print(in_full(a.first + 20_000 + k, a.units, a.jobs))
     if a.odds:

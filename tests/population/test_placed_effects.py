@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import triaxcal as tc
-from tests.population.worlds import KINDS, YEAR_S, World, judged, world
+from tests.population.worlds import KINDS, YEAR_S, World, judged, with_broken_end, world
 from triaxcal.population import Form, PlacedEffects, PlaceKind, UnitRun, Verdict, placed_effects
+from triaxcal.population.statements import _listed
 
 SMALL = 150
 """Units of the fast worlds."""
@@ -99,6 +100,35 @@ def test_a_broken_unit_and_a_unit_that_is_measured_often_are_no_effect_of_a_plac
     rng = np.random.default_rng(5)
     golden = [replace(g, coefficients=g.coefficients + rng.normal(size=9) * 1e-5) for g in golden]
     assert placed_effects([*runs, *golden]).statements == ()
+
+
+@pytest.mark.parametrize("seed", range(70, 78))
+def test_a_broken_unit_among_the_last_runs_is_no_drift_of_a_place(seed: int) -> None:
+    assert placed_effects(with_broken_end(small(seed, 0), seed).runs).statements == ()
+
+
+def test_equal_coefficients_have_no_spread_and_no_effect() -> None:
+    runs = runs_at([("S1", "F1") if i % 2 else ("S2", "F2") for i in range(70)], np.zeros(70))
+    found = placed_effects([replace(run, coefficients=runs[0].coefficients) for run in runs])
+    assert (found.statements, found.candidates, found.runs) == ((), (), 70)
+
+
+def test_a_drift_counts_the_runs_after_its_begin() -> None:
+    rng = np.random.default_rng(6)
+    places = [("S1", str(rng.choice(["F1", "F2"]))) for _ in range(200)]
+    inside = np.array([fixture == "F2" for _, fixture in places])
+    ramp = np.clip((np.arange(200) - 100) / 100, 0.0, None)
+    (statement,) = placed_effects(runs_at(places, 12.0 * ramp * inside)).statements
+    assert statement.pattern.form is Form.DRIFT
+    assert statement.since_s is not None
+    assert abs(statement.since_s / 86400 - 100) < 30
+    assert statement.runs == np.sum(inside & (86400.0 * np.arange(200) > statement.since_s))
+
+
+def test_a_place_is_listed_alone_only_where_it_is_certain() -> None:
+    rest = dict.fromkeys("bcde", 0.004)
+    assert list(_listed({"a": 0.992} | rest, 0.99)) == ["a"]
+    assert list(_listed({"a": 0.984} | rest, 0.99)) == ["a", "b"]
 
 
 def test_repeated_units_tell_a_small_shift_that_different_units_hide() -> None:

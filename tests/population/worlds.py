@@ -8,7 +8,7 @@ nine coefficients take what they absorb of it. The size of an effect is in sprea
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -100,6 +100,20 @@ def world(
         truths.append(found)
     order = np.argsort(draft.time)
     return World(_runs(draft, poses, order), tuple(truths), {k: i[order] for k, i in inside.items()})
+
+
+BROKEN_SPREADS, LAST_RUNS = 15.0, 3
+"""Of one coefficient of a broken unit, and the runs at the end of which one is of it."""
+
+
+def with_broken_end(made: World, seed: int) -> World:
+    """One of the last runs is of a broken unit: no effect of a place."""
+    rng = np.random.default_rng(seed)
+    i, k = len(made.runs) - 1 - int(rng.integers(LAST_RUNS)), int(rng.integers(9))
+    size = BROKEN_SPREADS * SPREAD[k] * (COUNTS if k < 3 else 1.0) * rng.choice([-1, 1])
+    runs = list(made.runs)
+    runs[i] = replace(runs[i], coefficients=runs[i].coefficients + size * np.eye(9)[k])
+    return replace(made, runs=runs)
 
 
 def _draft(rng: np.random.Generator, units: int, batches: int) -> _Draft:

@@ -83,12 +83,15 @@ def _loop_in(document: Mapping[str, Any], where: str) -> schema.Loop:
 def _effects_in(loop: schema.Loop) -> dict[str, SeenEffect]:
     """The effects of the catalogue and those that the document names. Those that the
     poses could not show are not known; a name that is not listed is unlikely."""
-    odds = {} if loop.odds is None else {name: o for name, o in loop.odds.effects.items() if o is not None}
     stated: dict[str, float | None] = dict.fromkeys((e.name for e in CATALOGUE), 0.0)
     stated |= loop.probabilities
     stated |= {f.effect: f.probability for f in loop.findings}
     blind = [name for name in loop.calibration.blind_to if not stated.get(name)]
     stated = {name: p for name, p in stated.items() if name not in blind}
+    # The possible names had the odds of any effect between them, but for learned ones.
+    names = stated.keys() | {name for finding in loop.findings for name in finding.alternatives}
+    odds = {name: Odds().of_effect(name, len(names)) for name in names}
+    odds |= {} if loop.odds is None else {name: o for name, o in loop.odds.effects.items() if o is not None}
     return seen_effects(stated, [(f.effect, f.probabilities) for f in loop.findings if f.alternatives], odds)
 
 

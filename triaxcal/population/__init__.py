@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         one_sided_run_length,
     )
     from triaxcal.population.distributions import (
+        GROUP_LEAST,
         QUANTILES,
         Distribution,
         Heterogeneity,
@@ -97,6 +98,7 @@ _NAMES = {
         "one_sided_run_length",
     ),
     "distributions": (
+        "GROUP_LEAST",
         "QUANTILES",
         "Distribution",
         "Heterogeneity",
@@ -130,6 +132,7 @@ _NAMES = {
 }
 
 __all__ = [
+    "GROUP_LEAST",
     "LEAST_RUNS",
     "LEVEL",
     "PPK_LEAST",

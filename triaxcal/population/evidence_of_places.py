@@ -84,6 +84,18 @@ class Level:
         prior = self.grid.windows.log_prior - np.log(len(sums.places.names))
         return np.where(enough, prior, -np.inf)
 
+    def _allowed_ramps(self, sums: Sums, known: Bools, allowed: Floats) -> Floats:
+        """(n,k) log priors of places and ramps, −∞ where no window of the place is
+        ``allowed`` (n,w), or where too few runs carry the ramp: those after its begin,
+        and their effective number (Σw)²/Σw², as the last ones count most."""
+        known = np.asarray(known, dtype=float)
+        cells = sums.by_cell(np.stack([known, known / self.search.count], axis=1))
+        least = np.array([FEWEST, UNITS])
+        carried = sums.by_ramp(cells) ** 2 / np.maximum(sums.by_ramp(cells, 2), TINY)
+        enough = (sums.after_begin(cells) >= least).all(axis=-1) & (carried >= least).all(axis=-1)
+        some = np.asarray(np.isfinite(allowed).any(axis=1, keepdims=True))
+        return np.where(enough & some, self.grid.ramps[1] - np.log(len(sums.places.names)), -np.inf)
+
     # The data of one group, given the other effects.
 
     def residual(self, g: int) -> tuple[Floats, Floats]:
@@ -96,16 +108,24 @@ class Level:
         weight = group.weight / scale**2
         rest = left if self.own is None else left - self.own.added.get(g, 0.0)
         r = self._centred(rest, weight) * np.sqrt(weight)
-        robust = t_weight(r)
-        far = (np.abs(r) > OUTLYING) & (weight > 0)
-        if far.any():
-            robust[far] = np.maximum(robust[far], t_weight(self._from_neighbours(r, weight > 0, far)))
+        robust = self._robust(r, weight)
+        if self.own is not None:
+            # An effect that a few broken units make would explain these.
+            robust = np.minimum(robust, self._robust(self._centred(left, weight) * np.sqrt(weight), weight))
         # The variance of the score is the information.
         used = weight > 0
         square = np.sum(np.where(used, robust**2 * np.minimum(r, 4.0).clip(-4.0) ** 2, 0.0), axis=0)
         calibrated = np.sum(np.where(used, robust, 0.0), axis=0) / np.maximum(square, 1e-12)
         weight = weight * robust * np.clip(calibrated, 0.3, 1.2)
         return self._centred(left, weight), weight
+
+    def _robust(self, r: Floats, weight: Floats) -> Floats:
+        """(N,d) weights of outliers among deviations ``r`` (N,d) in spreads; none is
+        one that its neighbours in a place share."""
+        robust, far = t_weight(r), (np.abs(r) > OUTLYING) & (weight > 0)
+        if far.any():
+            robust[far] = np.maximum(robust[far], t_weight(self._from_neighbours(r, weight > 0, far)))
+        return robust
 
     def log_likelihood(self, g: int) -> float:
         """Of what the effects leave, with Student's t."""
@@ -212,12 +232,7 @@ class Level:
                     h = h + sums.pairs_by_ramp(pairs, between)
                     h = h - sum(sums.by_ramp(part) ** 2 / total for part, total in taken)
                     spread = scatter.of_ramps()
-                    everything = allowed.max(axis=1)
-                    base = (
-                        self.grid.ramps[1]
-                        - np.log(len(everything))
-                        + np.where(np.isfinite(everything), 0, -np.inf)[:, None]
-                    )
+                    base = self._allowed_ramps(sums, known, allowed)
                 h = np.maximum(h, 0.0)
                 s, h = s / spread, h / spread
                 prior = base + start + np.log(search.prior.forms[form]) - np.log(len(patterns))

@@ -342,6 +342,8 @@ def _whitening(scaled: Floats, pairs: Ints, whole: Bools, by_pairs: bool) -> tup
     clipped = np.clip(differences, -CLIP, CLIP)
     size, axes = np.linalg.eigh(clipped.T @ clipped / len(clipped))
     axes = axes[:, size > RANK * size[-1]]
+    if not axes.shape[1]:
+        return axes.T, axes
     differences, d = differences @ axes, axes.shape[1]
     covariance = np.diag(_median(differences**2) / CHI2_MEDIAN)
     for _ in range(ROUNDS):

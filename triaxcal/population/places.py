@@ -192,6 +192,10 @@ class Sums:
         """(n,k,d) sums times the ramps."""
         return np.asarray(np.einsum("kg,ngd->nkd", self.grid.ramps[0] ** power, by_cell, optimize=True))
 
+    def after_begin(self, by_cell: Floats) -> Floats:
+        """(n,k,d) sums over the cells in which each ramp is above 0."""
+        return np.asarray(np.einsum("kg,ngd->nkd", self.grid.ramps[0] > 0, by_cell, optimize=True))
+
     def pairs_by_window(self, pairs: Ints, value: Floats) -> Floats:
         """(n,w,d) sums of ``value`` (p,d) over ``pairs`` (p,2) of runs that are both in
         the place and the window."""

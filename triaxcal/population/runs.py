@@ -30,7 +30,7 @@ class PlaceKind(StrEnum):
     """A slot of a fixture, or of a station if the fixture is unknown."""
     OPERATOR = "operator"
     HOUR = "hour"
-    """A span of hours of the day, such as 14-18."""
+    """A span of hours of the day, UTC, such as 14-18."""
     EVERYWHERE = "everywhere"
     """All runs, for some time."""
 
@@ -75,7 +75,7 @@ class SeenPoses:
 class UnitRun:
     """One calibration of one unit.
 
-    ``time_s`` is in seconds since any epoch, ``hour`` of the day 0 to 24. A place
+    ``time_s`` is in seconds since any epoch, ``hour`` of the day 0 to 24, UTC. A place
     that is not known is None. ``coefficients`` (9,) are `COEFFICIENTS` [output/g, rad,
     g], ``standard_errors`` (9,) theirs. ``resolution`` is one step of the converter in
     output units, None if unknown. ``figures`` are any further ones, with standard

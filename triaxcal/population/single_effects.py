@@ -74,9 +74,12 @@ class Search:
         return cls(runs, prior)
 
     def _standardise(self, fitted: Mapping[int, Floats]) -> None:
-        self.groups: list[Standardised] = [
+        every = [
             standardised(g, self.part, self._followers, self._same_unit, fitted.get(i)) for i, g in enumerate(self._raw)
         ]
+        # Figures that do not vary between units have no spread to be measured by.
+        self.groups: list[Standardised] = [g for g in every if len(g.mix)]
+        self._raw = [g.group for g in self.groups]
         self.subjects: list[int | str] = [*range(len(self.groups)), *self.likelihood]
         self.of_residuals = {i for i, g in enumerate(self._raw) if g.kind in (FigureKind.CONVERTER, FigureKind.POSES)}
         """Groups that are two views of the same residuals."""
@@ -249,13 +252,16 @@ class Search:
     # What is read off.
 
     def time_of(
-        self, posterior: Posterior, best: Family, place: int, fewest: int
+        self, posterior: Posterior, best: Family, place: int
     ) -> tuple[int, float | None, tuple[float, float] | None, float | None]:
+        """Runs in it, begin with its interval, and end. A window that holds all runs of
+        the place is always; of a drift those after its begin count."""
         grid, inside = posterior.grid, best.places.inside(place)
         if best.form is Form.DRIFT:
             k = int(np.argmax(best.log[place]))
             since = grid.ramp_begins(k) if k else None
-            return int(inside.sum()), since, None, None
+            acting = inside & (self.time > since) if since is not None else inside
+            return int(acting.sum()), since, None, None
         p = np.exp(best.log[place] - log_sum_exp(best.log[place]))
         window = int(np.argmax(p))
         first, end = grid.windows.first[window], grid.windows.end[window]

@@ -18,9 +18,8 @@ from enum import StrEnum
 from typing import TypeVar
 
 from triaxcal.errors import InvalidData
-from triaxcal.population.figures import FigureKind
-from triaxcal.population.hypotheses import Family, Form, PlacePrior, Posterior, SingleEffect
-from triaxcal.population.places import FEWEST
+from triaxcal.population.figures import LEAST_RUNS, FigureKind
+from triaxcal.population.hypotheses import Family, Form, PlacePrior, SingleEffect
 from triaxcal.population.runs import PlaceKind, UnitRun
 from triaxcal.population.single_effects import Search
 
@@ -114,7 +113,7 @@ def placed_effects(runs: Sequence[UnitRun], prior: PlacePrior | None = None) -> 
     prior = prior or PlacePrior()
     used = _enough(runs)
     if not used:
-        raise InvalidData(f"{len(runs)} runs: effects of places need {LEAST} of one part number")
+        raise InvalidData(f"{len(runs)} runs: effects of places need {LEAST_RUNS} of one part number")
     search = Search.of(used, prior)
     found = search.run()
     said = [_statement(search, effect) for effect in found]
@@ -129,16 +128,14 @@ def placed_effects(runs: Sequence[UnitRun], prior: PlacePrior | None = None) -> 
     )
 
 
-LEAST = 60
-"""Runs of a part number."""
-
-
 def _enough(runs: Sequence[UnitRun]) -> list[UnitRun]:
     """Runs of part numbers that have enough of them, by time."""
     count: dict[str | None, int] = defaultdict(int)
     for run in runs:
         count[run.part_number] += 1
-    return sorted((run for run in runs if count[run.part_number] >= LEAST), key=lambda run: (run.time_s, run.serial))
+    return sorted(
+        (run for run in runs if count[run.part_number] >= LEAST_RUNS), key=lambda run: (run.time_s, run.serial)
+    )
 
 
 LISTED = 0.01
@@ -160,9 +157,10 @@ def _statement(search: Search, effect: SingleEffect) -> Statement:
     if acts < search.prior.certain:
         verdict = Verdict.CANDIDATE
     else:
-        verdict = Verdict.NAMED if len(places_found) == 1 else Verdict.CONFOUNDED
+        alone = next(iter(places_found.values())) >= search.prior.certain
+        verdict = Verdict.NAMED if alone else Verdict.CONFOUNDED
     best, place, _ = posterior.best()
-    inside, since, interval, until = _time_of(search, posterior, best, place)
+    inside, since, interval, until = search.time_of(posterior, best, place)
     return Statement(
         verdict, acts, places_found, _listed(of_pattern, search.prior.certain), since, interval, until,
         {name: Change(*values) for name, values in search.sizes(effect).items()}, inside,
@@ -180,18 +178,11 @@ K = TypeVar("K")
 
 
 def _listed(share: Mapping[K, float], certain: float) -> dict[K, float]:
-    """The smallest set that has the truth for certain, the likeliest first."""
+    """The smallest set that has the truth for certain, the likeliest first; two at
+    least where the first alone does not."""
     out: dict[K, float] = {}
     for key, p in sorted(share.items(), key=lambda item: -item[1]):
-        if out and (sum(out.values()) >= certain or p < LISTED):
+        if out and (sum(out.values()) >= certain or (p < LISTED and len(out) > 1)):
             break
         out[key] = p
     return out
-
-
-def _time_of(
-    search: Search, posterior: Posterior, best: Family, place: int
-) -> tuple[int, float | None, tuple[float, float] | None, float | None]:
-    """Runs in it, begin with its interval, and end. A window that holds all runs of
-    the place is always."""
-    return search.time_of(posterior, best, place, FEWEST)

@@ -26,7 +26,7 @@ def place(found: Place) -> str:
         case PlaceKind.EVERYWHERE:
             return "all runs"
         case PlaceKind.HOUR:
-            return f"hours {found.name}"
+            return f"hours {found.name} UTC"
         case _:
             return f"{found.kind.value} {found.name}"
 
@@ -61,14 +61,20 @@ def line(found: Statement, day: Callable[[float], str]) -> str:
     """One line; ``day`` writes a time in seconds as a date."""
     where = " or ".join(map(place, found.places))
     certain = "" if found.verdict is not Verdict.CANDIDATE else f" (probability {chance(found.probability)})"
-    when = f" since {day(found.since_s)}" if found.since_s is not None else ""
+    when = f" since {day(found.since_s)}{_between(found, day)}" if found.since_s is not None else ""
     when += f" until {day(found.until_s)}" if found.until_s is not None else ""
     return f"{where}{when}: {pattern(found.pattern)}{certain}; {sizes(found)}; {found.runs} runs"
 
 
+def _between(found: Statement, day: Callable[[float], str]) -> str:
+    ends = [] if found.since_interval_s is None else [day(end) for end in found.since_interval_s]
+    return f" (95 %: {' to '.join(ends)})" if len(set(ends)) > 1 else ""
+
+
 def sizes(found: Statement) -> str:
-    """The largest changes."""
-    return "; ".join(_size(name, change) for name, change in [*found.sizes.items()][:SHOWN])
+    """The largest changes; shares, and relative changes of scale factors, in per
+    cent."""
+    return "; ".join(_size(found.pattern, name, change) for name, change in [*found.sizes.items()][:SHOWN])
 
 
 def lines(found: PlacedEffects, day: Callable[[float], str]) -> list[str]:
@@ -76,7 +82,17 @@ def lines(found: PlacedEffects, day: Callable[[float], str]) -> list[str]:
     return [line(statement, day) for statement in (*found.statements, *found.candidates)]
 
 
-def _size(name: str, change: Change) -> str:
+def _size(of: Pattern, name: str, change: Change) -> str:
+    if of.form is Form.SCATTER:
+        return f"scatter {_measured(change, 1)} times as large"
+    if of.form is Form.FREQUENCY:
+        return f"in {_measured(change, 100)} % of units"
     name = NAMES.get(name, name)
+    if of.kind is FigureKind.COEFFICIENTS and change.unit in ("", "1"):
+        return f"{name} {_measured(change, 100)} %"
     unit = f" {change.unit}" if change.unit not in ("", "1") else ""
-    return f"{name} {plain(change.value, 3)} ± {plain(change.uncertainty, 2)}{unit}"
+    return f"{name} {_measured(change, 1)}{unit}"
+
+
+def _measured(change: Change, times: int) -> str:
+    return f"{plain(times * change.value, 3)} ± {plain(times * change.uncertainty, 2)}"

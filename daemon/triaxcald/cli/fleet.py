@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from typing import Any
-from urllib.parse import urlsplit
 
 import triaxcal as tc
 from triaxcald.cli.console import at, emit, erased, say, show, table
@@ -67,13 +66,12 @@ def fleet_command(a: argparse.Namespace) -> int:
 
 
 def _shown(source: str) -> str:
-    """Without the password of a database."""
-    if "://" not in source:
+    """A database without its password."""
+    if "://" not in source or source.startswith("sqlite:"):
         return source
-    parts = urlsplit(source)
-    user = f"{parts.username}@" if parts.username else ""
-    port = f":{parts.port}" if parts.port else ""
-    return f"{parts.scheme}://{user}{parts.hostname or ''}{port}{parts.path}"
+    from triaxcald.service.database import shown_address
+
+    return shown_address(source)
 
 
 def _reading(done: int, of: int) -> None:
@@ -82,25 +80,27 @@ def _reading(done: int, of: int) -> None:
 
 
 def _show(document: dict[str, Any]) -> None:
-    from triaxcald.fleet.page import differing, mean_of, notices, percent, roughly, title_of
+    from triaxcald.fleet.page import differing, mean_of, notices, percent, roughly, title_of, worst_study
 
     for product in document["products"]:
-        part = product["part_number"]
+        part, failed = product["part_number"], product["left_out"]
+        without = f", without {tc.number_format.number_of(failed, 'run')} that failed or were stopped" if failed else ""
         show(
             f"{f'part number {part}: ' if part else ''}{tc.number_format.number_of(product['units'], 'unit')} in "
             f"{tc.number_format.number_of(product['runs'], 'run')}, {product['repeated']} measured more than once"
+            f"{without}"
         )
         figures: Sequence[dict[str, Any]] = product["figures"][:SHOWN_MOST]
         rows = [
             [
                 title_of(f["name"]), str(f["n"]), mean_of(f), roughly(f["distribution"]["sd"], f["unit"]),
                 "—" if f["charts"] is None else str(f["charts"]["cusum"]["count"]),
-                percent(next((study["grr"] for study in f["gauge"]), None)), differing(f),
+                percent((worst_study(f) or {}).get("grr")), differing(f),
             ]
             for f in figures
         ]  # fmt: skip
         head = ["figure", "units", "mean", "sd", "CUSUM", "%GRR", "differs by"]
-        table("one value a unit; signals of the CUSUM; repeatability of units that repeat", head, rows)
+        table("one value a unit; signals of the CUSUM; %GRR by the factor that matters most", head, rows)
         for text in notices(product):
             show(f"* {text}")
         if (interval := product["recalibration"]) is not None:

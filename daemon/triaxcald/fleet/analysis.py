@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 import triaxcal as tc
 from triaxcald.fleet.places import Placed
 from triaxcald.fleet.reading import Row
-from triaxcald.fleet.values import Figure, Fleet
+from triaxcald.fleet.values import FAILED, Figure, Fleet
 from triaxcald.service.quality import COEFFICIENTS, FIGURES
 
 CHARTED_LEAST: Final = 8
@@ -23,6 +23,9 @@ REPEATED_LEAST: Final = 5
 STUDIED_MOST: Final = 2000
 """Runs of a gauge study and of a drift, those of evenly spread units: more would make
 no figure better known than it is used."""
+PAIRS_MOST: Final = 25
+"""Pairs of successive runs of one unit in them: as many short times as long ones. The
+work grows with the third power of a unit's runs."""
 NAMED_MOST: Final = 20
 LAST: Final = 10
 GROUPS_MOST: Final = 40
@@ -66,12 +69,15 @@ def fleet_document(
 def _product(fleet: Fleet, asked: Asked, placed: Sequence[Placed]) -> dict[str, Any]:
     comparing = _Comparing.of(fleet)
     drifts = {name: found for name in fleet.figures if (found := _drift(fleet, name)) is not None}
-    repeated = int(np.sum(np.bincount(fleet.unit[fleet.unit >= 0], minlength=1) > 1))
+    known = fleet.unit >= 0
+    runs_of_unit = np.bincount(fleet.unit[known], minlength=1)
+    failed = known & fleet.with_verdict(*FAILED)
     return {
         "part_number": fleet.part_number,
         "units": len(fleet.serials),
         "runs": len(fleet.rows),
-        "repeated": repeated,
+        "repeated": int(np.sum(runs_of_unit > 1)),
+        "left_out": int(np.sum(runs_of_unit[fleet.unit[failed]] > 1)),
         "first": fleet.rows[0]["ended"],
         "last": fleet.rows[-1]["ended"],
         "factors": {name: len(set(labels) - {None}) for name, labels in fleet.factors.items()},
@@ -80,7 +86,7 @@ def _product(fleet: Fleet, asked: Asked, placed: Sequence[Placed]) -> dict[str, 
         "figures": [_figure(fleet, name, comparing, drifts.get(name)) for name in fleet.figures if comparing.n(name)],
         "effects": _effects(fleet, comparing),
         "recalibration": _recalibration(fleet, drifts, asked),
-        "places": [_placed(value) for value in sorted(placed, key=lambda value: -value.probability)],
+        "places": [value.document for value in sorted(placed, key=lambda value: -value.probability)],
     }
 
 
@@ -291,9 +297,13 @@ def _interval(ends: Sequence[float | None] | None, digits: int) -> list[float | 
 
 
 def _repeated(fleet: Fleet, values: tc.Floats) -> tc.Ints:
-    """Runs of units with two values or more: all, or of evenly spread units as many as
-    `STUDIED_MOST`."""
-    rows = np.flatnonzero(np.isfinite(values) & (fleet.unit >= 0))
+    """Runs that did not fail, of units with two values or more: all, or of evenly
+    spread units as many as `STUDIED_MOST`, with `PAIRS_MOST` of each."""
+    rows = np.flatnonzero(np.isfinite(values) & (fleet.unit >= 0) & ~fleet.with_verdict(*FAILED))
+    counts = np.bincount(fleet.unit[rows], minlength=len(fleet.serials))
+    for unit in np.flatnonzero(counts > 2 * PAIRS_MOST):
+        mine = fleet.unit[rows] == unit
+        rows = np.sort(np.concatenate([rows[~mine], _thinned(rows[mine])]))
     counts = np.bincount(fleet.unit[rows], minlength=len(fleet.serials))
     units = np.flatnonzero(counts > 1)
     if len(units) < REPEATED_LEAST:
@@ -302,6 +312,12 @@ def _repeated(fleet: Fleet, values: tc.Floats) -> tc.Ints:
         share = STUDIED_MOST / counts[units].sum()
         units = units[np.linspace(0, len(units) - 1, max(REPEATED_LEAST, int(share * len(units)))).astype(np.int64)]
     return rows[np.isin(fleet.unit[rows], units)]
+
+
+def _thinned(rows: tc.Ints) -> tc.Ints:
+    """Of one unit's runs, by time: evenly spread pairs of successive ones."""
+    first = np.linspace(0, len(rows) - 2, PAIRS_MOST).astype(np.int64)
+    return np.asarray(rows[np.unique(np.concatenate([first, first + 1]))])
 
 
 def _gauges(fleet: Fleet, figure: Figure) -> list[dict[str, Any]]:
@@ -430,7 +446,3 @@ def _new(fleet: Fleet, name: str) -> float:
         return 0.0
     scale = abs(float(np.nanmedian(figure.values))) if name.startswith("scale_factor") else 1.0
     return float(np.median(stated)) / (scale or 1.0)
-
-
-def _placed(value: Placed) -> dict[str, Any]:
-    return asdict(value) | {"probability": tc.rounding.chance(value.probability)}

@@ -132,8 +132,9 @@ def _differences(product: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _farthest(comparison: Mapping[str, Any]) -> str:
-    """The group whose median is farthest from that of all."""
-    far = max(comparison["groups"], key=lambda g: abs(g["apart"] or 0.0), default=None)
+    """The group whose median is farthest from that of all, among those compared."""
+    compared = [group for group in comparison["groups"] if group["n"] >= tc.population.GROUP_LEAST]
+    far = max(compared, key=lambda g: abs(g["apart"] or 0.0), default=None)
     if far is None or not far["apart"] or comparison["location_p"] is None or comparison["location_p"] >= 0.05:
         return ""
     return f", most at {clean(far['name'])}"
@@ -147,24 +148,64 @@ def _signals(product: Mapping[str, Any]) -> Iterator[str]:
         many = [
             (name, charts[key])
             for key, name in (("individuals", "individuals chart"), ("ewma", "EWMA"), ("cusum", "CUSUM"))
-            if charts[key]["count"] > SIGNALS_MANY * max(charts[key]["expected"], 1.0)
+            if _many(charts[key])
         ]
         if many:
             told = ", ".join(
                 f"{of['count']} signals of the {name} (by chance {digits(of['expected'], 2)})" for name, of in many
             )
-            since = charts["cusum"]["since"]
-            moved = f"; the mean last moved about {since[-1]['time'][:10]}" if since else ""
+            last = last_move(charts)
+            moved = f"; the mean last moved about {last['time'][:10]}" if last else ""
             yield f"{title_of(figure['name'])}: {told}{moved}."
+
+
+def _many(chart: Mapping[str, Any]) -> bool:
+    return bool(chart["count"] > SIGNALS_MANY * max(chart["expected"], 1.0))
+
+
+def last_move(charts: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The first run of the last signal of the CUSUM, where more come than by chance."""
+    since = charts["cusum"]["since"]
+    return since[-1] if since and _many(charts["cusum"]) else None
 
 
 def _gauges(product: Mapping[str, Any]) -> Iterator[str]:
     """The factor that matters most."""
     for figure in product["figures"]:
-        worst = _worst(figure)
+        worst = worst_study(figure)
         if worst is not None and worst["grr"] > GAUGE_FAILS and figure["name"] in TITLES:
-            by = f" (gauge study by {worst['factor']})" if worst["factor"] else ""
-            yield f"{title_of(figure['name'])}: the measurement makes {percent(worst['grr'])} of the scatter{by}."
+            by = f" by {worst['factor']}" if worst["factor"] else ""
+            yield f"{title_of(figure['name'])}: %GRR {percent(worst['grr'])}{by} (above 30 %: not acceptable, AIAG)."
+
+
+# Effects of places.
+
+
+def place_words(place: Mapping[str, Any]) -> str:
+    """ "fixture F2"; "hours 14-18 UTC"."""
+    kind = tc.population.PlaceKind(place["kind"])
+    return tc.text.population.place(tc.population.Place(kind, place["name"]))
+
+
+def where(value: Mapping[str, Any]) -> str:
+    """All places that it may be of."""
+    text = " or ".join(map(place_words, value["places"]))
+    return text[:1].upper() + text[1:]
+
+
+def acting(value: Mapping[str, Any]) -> str:
+    """The time in which it acts."""
+    interval = value["since_interval"]
+    began = f" (95 %: {interval[0]} to {interval[1]})" if interval and interval[0] != interval[1] else ""
+    match value["since"], value["until"]:
+        case None, None:
+            return "always"
+        case None, until:
+            return f"until {until}"
+        case since, None:
+            return f"since {since}{began}"
+        case since, until:
+            return f"from {since}{began} until {until}"
 
 
 # How the page writes figures.
@@ -210,7 +251,7 @@ def gauge_table(product: Mapping[str, Any]) -> dict[str, Any]:
     return {"factors": known, "rows": [_gauge_row(figure, known) for figure in studied]}
 
 
-def _worst(figure: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def worst_study(figure: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The study by the factor that matters most; that of repetition where there is no
     factor."""
     studies = [study for study in figure["gauge"] if study["factor"]] or figure["gauge"]
@@ -219,7 +260,7 @@ def _worst(figure: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 def _gauge_row(figure: Mapping[str, Any], factors: Sequence[str]) -> dict[str, Any]:
     by = {study["factor"]: study for study in figure["gauge"]}
-    worst = _worst(figure) or {}
+    worst = worst_study(figure) or {}
     alone = by.get(None, worst)["components"]
     scale = Scale.of(np.array([alone["part"]["sd"], alone["repeatability"]["sd"]]), figure["unit"])
 
@@ -296,9 +337,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "between": between, "chance": figures.chance, "concise": concise, "differing": differing, "digits": digits,
+        "acting": acting, "between": between, "chance": figures.chance, "concise": concise, "differing": differing,
+        "digits": digits,
         "drift_table": drift_table, "effect_title": tc.text.traces.effect_title, "gauge_table": gauge_table,
-        "lasting": lasting, "mean_of": mean_of, "p_value": figures.p_value, "percent": percent, "percents": percents,
+        "last_move": last_move, "lasting": lasting, "mean_of": mean_of,
+        "p_value": figures.p_value, "percent": percent, "percents": percents,
+        "place_words": place_words, "where": where,
         "roughly": roughly, "title_of": title_of,
     }  # fmt: skip
     environment.tests["differing"] = differs

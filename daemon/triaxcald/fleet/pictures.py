@@ -24,8 +24,6 @@ DIFFERS: Final = 0.05
 """Adjusted p-value from which groups are drawn."""
 GROUPS_DRAWN: Final = 12
 """Of a factor, those farthest from all units."""
-GROUP_LEAST: Final = 3
-"""Units of a group that is drawn."""
 UNITS_DRAWN: Final = 300
 """Of a control chart, the last ones."""
 LONGEST: Final = 20
@@ -84,7 +82,7 @@ def _groups_drawn(
 ) -> tuple[str, list[tuple[str, tc.Floats]]]:
     factor = comparison["factor"]
     group, names = fleet.groups(factor)
-    large = [g for g in comparison["groups"] if g["n"] >= GROUP_LEAST]
+    large = [g for g in comparison["groups"] if g["n"] >= tc.population.GROUP_LEAST]
     shown = sorted(large, key=lambda g: -abs(g["apart"] or 0.0))[:GROUPS_DRAWN]
     return factor, [
         (g["name"], values[group[last] == names.index(g["name"])]) for g in sorted(shown, key=lambda g: g["name"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -26,16 +26,47 @@ Tell = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Placed:
-    """An effect of a place, as a page shows it. ``since`` is a date, UTC."""
+class PlaceOfEffect:
+    """``probability`` that it is this place, if the effect acts."""
 
     kind: str
-    place: str
+    name: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect of a place, as a page shows it. ``kind`` and ``place`` are those of the
+    likeliest of ``places``. ``since`` and ``until`` are dates, UTC, None where it acts
+    from the first run on, and to the last; ``since_interval`` has the former with
+    95 %."""
+
+    verdict: str
+    places: tuple[PlaceOfEffect, ...]
     since: str | None
+    since_interval: tuple[str, str] | None
+    until: str | None
     figure: str
     probability: float
     size: str
     text: str
+
+    @property
+    def document(self) -> dict[str, Any]:
+        first = self.places[0]
+        return {
+            "kind": first.kind,
+            "place": first.name,
+            "verdict": self.verdict,
+            "places": [asdict(place) | {"probability": tc.rounding.chance(place.probability)} for place in self.places],
+            "since": self.since,
+            "since_interval": None if self.since_interval is None else list(self.since_interval),
+            "until": self.until,
+            "figure": self.figure,
+            "probability": tc.rounding.chance(self.probability),
+            "size": self.size,
+            "text": self.text,
+        }
 
 
 def placed(fleet: Fleet, folder: Path | None, tell: Tell = lambda done, of: None) -> list[Placed]:
@@ -50,10 +81,13 @@ def placed(fleet: Fleet, folder: Path | None, tell: Tell = lambda done, of: None
 
 
 def _shown(of: tc.population.Statement) -> Placed:
+    began = of.since_interval_s
     return Placed(
-        of.place.kind.value,
-        " or ".join(place.name for place in of.places),
+        of.verdict.value,
+        tuple(PlaceOfEffect(place.kind.value, place.name, p) for place, p in of.places.items()),
         None if of.since_s is None else _day(of.since_s),
+        None if began is None else (_day(began[0]), _day(began[1])),
+        None if of.until_s is None else _day(of.until_s),
         tc.text.population.pattern(of.pattern),
         of.probability,
         tc.text.population.sizes(of),

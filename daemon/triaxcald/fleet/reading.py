@@ -16,6 +16,7 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import DOCUMENT_MOST
 from triaxcald.schema.columns import NAMES
 from triaxcald.store import TIMES, Store, timed_in
+from triaxcald.work import plain_serial
 
 Row = dict[str, Any]
 WORK: Final = ("part_number", "batch", "station", "fixture", "slot", "operator", "order", "serial")
@@ -33,9 +34,14 @@ class Selection:
 
     def takes(self, row: Row) -> bool:
         return all(
-            wanted in (row["serial"], row["work_serial"]) if name == "serial" else row[name] == wanted
+            plain_serial(wanted) in _plain(row) if name == "serial" else row[name] == wanted
             for name, wanted in self.equal.items()
         )
+
+
+def _plain(row: Row) -> list[str]:
+    """Serial numbers of the unit, without leading zeros."""
+    return [plain_serial(text) for text in (row["serial"], row["work_serial"]) if text is not None]
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ def _of_server(url: str, given: Mapping[str, int | None]) -> Sequence[tuple[Any,
         raise InputError(f"a database of several stations: {hint}")
     from triaxcald.service.every_station import runs_of_every_station
 
-    return runs_of_every_station(url, since_us=given["since_us"], until_us=given["until_us"])
+    return runs_of_every_station(url, named="the database", since_us=given["since_us"], until_us=given["until_us"])
 
 
 def _of_folder(path: Path, given: Mapping[str, int | None]) -> tuple[Sequence[tuple[Any, ...]], list[str]]:
@@ -143,7 +149,7 @@ def certified_in(text: str) -> Certified:
     """Of the text of a `triaxcal.certificate/1`. Raises ValueError for another."""
     try:
         return _certified(_cut_out(text))
-    except (KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, AttributeError, RecursionError):
         pass
     try:
         result = json.loads(text)["result"]

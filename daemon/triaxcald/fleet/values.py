@@ -10,9 +10,11 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 import triaxcal as tc
 from triaxcald.fleet.reading import Certified, Row, Runs
+from triaxcald.schema.codes import Verdict
 from triaxcald.service.golden import is_check
 from triaxcald.service.quality import COEFFICIENTS, FIGURES, UNITS
 from triaxcald.work import plain_serial
@@ -24,6 +26,9 @@ UNCERTAINTIES: Final = {
 """Expanded uncertainties of |a|, and their keys in `expanded_uncertainty_g`."""
 FACTORS: Final = ("batch", "station", "fixture", "slot", "operator", "order")
 TIME: Final = "time"
+FAILED: Final = (Verdict.FAIL, Verdict.ABORTED)
+"""Verdicts of runs that say nothing of how a measurement repeats: what failed may have
+been a part of it."""
 EFFECT_LEAST: Final = 5
 """Units in which an effect is corrected, from which its coefficients are figures."""
 DAY_US: Final = 86_400_000_000
@@ -61,11 +66,23 @@ class Fleet:
     effects: Mapping[str, tc.Floats]
 
     def last(self, values: tc.Floats) -> tc.Ints:
-        """Index of the last run with a value of each unit, by the end of the runs."""
-        found = np.full(len(self.serials), -1, dtype=np.int64)
-        having = np.flatnonzero(np.isfinite(values) & (self.unit >= 0))
-        np.maximum.at(found, self.unit[having], having)
+        """Index of the last run with a value of each unit, by the end of the runs; an
+        aborted run stands for a unit only where no other does."""
+        having = np.isfinite(values) & (self.unit >= 0)
+        aborted = self.with_verdict(Verdict.ABORTED)
+        judged, other = self._last(having & ~aborted), self._last(having & aborted)
+        found = np.where(judged >= 0, judged, other)
         return np.sort(found[found >= 0])
+
+    def _last(self, having: NDArray[np.bool_]) -> tc.Ints:
+        found = np.full(len(self.serials), -1, dtype=np.int64)
+        rows = np.flatnonzero(having)
+        np.maximum.at(found, self.unit[rows], rows)
+        return found
+
+    def with_verdict(self, *verdicts: str) -> NDArray[np.bool_]:
+        """(n,) runs that ended with one of these."""
+        return np.array([row["verdict"] in verdicts for row in self.rows], dtype=bool)
 
     def groups(self, factor: str) -> tuple[tc.Ints, list[str]]:
         """Number (n,) of the group of each run, −1 without one, and the names of the

@@ -102,6 +102,7 @@ class EwmaChart(Signals):
 
 
 class CusumChart(Signals):
+    count: Annotated[int, Field(description="number of signals; after each both sums begin at zero")]
     reference: Annotated[tc.schema.Figure, Field(description="reference value k, in standard deviations")]
     decision: Annotated[tc.schema.Figure, Field(description="decision interval h, in standard deviations")]
     since: Annotated[list[Mention], Field(description="of each signal in `last`: the first run that its sum counts")]
@@ -239,12 +240,31 @@ class EffectOfFleet(tc.schema.Model):
     ]
 
 
+KIND_OF_PLACE = "`batch`, `station`, `fixture`, `slot`, `operator`, `hour`, `everywhere`"
+
+
+class PlaceOfEffect(tc.schema.Model):
+    kind: Annotated[str, Field(description=KIND_OF_PLACE)]
+    name: Annotated[str, Field(description="its name; of `hour` the hours, UTC, as `14-18`; empty for `everywhere`")]
+    probability: Annotated[Chance, Field(description="that it is this one, if the effect acts")]
+
+
 class PlacedValue(tc.schema.Model):
     """An effect that belongs to a place or a time instead of a unit."""
 
-    kind: Annotated[str, Field(description="`batch`, `station`, `fixture`, `slot`, `operator`, `hour`, `everywhere`")]
-    place: Annotated[str, Field(description="its name")]
-    since: Annotated[str | None, Field(description="since when, UTC; `null` for always")]
+    kind: Annotated[str, Field(description=f"of the likeliest place: {KIND_OF_PLACE}")]
+    place: Annotated[str, Field(description="its name; of `hour` the hours, UTC, as `14-18`")]
+    verdict: Annotated[
+        Literal["named", "confounded", "candidate"],
+        Field(
+            description="`named`: certain, at this place; `confounded`: certain, at one of `places`; `candidate`: "
+            "more likely than not"
+        ),
+    ]
+    places: Annotated[list[PlaceOfEffect], Field(description="places that the runs do not tell apart, likeliest first")]
+    since: Annotated[str | None, Field(description="since when, UTC; `null`: from the first run on")]
+    since_interval: Annotated[list[str] | None, Field(description="dates that hold it with 95 %; `null` if unknown")]
+    until: Annotated[str | None, Field(description="until when, UTC; `null`: to the last run")]
     figure: Annotated[str, Field(description="what changes")]
     probability: Annotated[Chance, Field(description="that it acts there")]
     size: Annotated[str, Field(description="by how much, in words")]
@@ -258,6 +278,10 @@ class Product(tc.schema.Model):
     units: Annotated[int, Field(description="number of units, by serial number")]
     runs: Annotated[int, Field(description="number of runs that measured something")]
     repeated: Annotated[int, Field(description="number of units with two runs or more")]
+    left_out: Annotated[
+        int,
+        Field(description="number of their runs that failed or were aborted: not in gauge studies and drifts"),
+    ]
     first: Annotated[str, Field(description="end of the first run, UTC")]
     last: Annotated[str, Field(description="end of the last run, UTC")]
     factors: Annotated[dict[str, int], Field(description="number of groups, by factor")]

@@ -118,21 +118,28 @@ def _set_up(engine: Engine) -> None:
         connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
 
 
-def postgresql_engine(url: str) -> Engine:
-    """Raises InputError for a URL that is none of PostgreSQL."""
+def postgresql_engine(url: str, named: str = "--database") -> Engine:
+    """Raises InputError for a URL that is none of PostgreSQL; the message calls it as
+    it is ``named``."""
     try:
         parsed = make_url(url)
-    except ArgumentError as e:
-        raise InputError("--database: expected a URL as postgresql://USER@HOST/NAME") from e
+    except (ArgumentError, ValueError) as e:  # the latter of a port, or of an address in brackets
+        raise InputError(f"{named}: expected a URL as postgresql://USER@HOST/NAME") from e
     if parsed.get_backend_name() not in ("postgresql", "postgres"):
-        raise InputError(f"--database: expected postgresql://…, not {parsed.drivername}://…")
+        raise InputError(f"{named}: expected postgresql://…, not {parsed.drivername}://…")
     parsed = URL.create(
         "postgresql+psycopg", parsed.username, parsed.password, parsed.host, parsed.port, parsed.database, parsed.query
     )
     try:
         return create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
     except (ImportError, NoSuchModuleError) as e:
-        raise InputError("--database: pip install 'triaxcal[postgres]' brings what speaks to PostgreSQL") from e
+        raise InputError(f"{named}: pip install 'triaxcal[postgres]' brings what speaks to PostgreSQL") from e
+
+
+def shown_address(url: str) -> str:
+    """Of an engine's URL: without its password, and without options, which may hold
+    one."""
+    return make_url(url).set(query={}).render_as_string(hide_password=True)
 
 
 def migrate(engine: Engine) -> None:

@@ -13,9 +13,12 @@ from triaxcald.service.database import answering, postgresql_engine
 from triaxcald.store import TIMES
 
 
-def runs_of_every_station(url: str, *, since_us: int | None, until_us: int | None) -> list[tuple[Any, ...]]:
+def runs_of_every_station(
+    url: str, *, named: str = "--database", since_us: int | None, until_us: int | None
+) -> list[tuple[Any, ...]]:
     """Rows with the cells of `NAMES` and `TIMES`, in the order of time; ``since_us``
-    and ``until_us`` as in `RunFilter`. Nothing is written. Raises InputError for a URL
+    and ``until_us`` as in `RunFilter`. Messages call the URL as it is ``named``.
+    Nothing is written. Raises InputError for a URL
     that is none, and for a database without our tables; DatabaseError."""
     run = tables.shared_run
     query = select(*(run.c[name] for name in (*NAMES, *TIMES))).order_by(run.c.at_us, run.c.outcome)
@@ -23,7 +26,7 @@ def runs_of_every_station(url: str, *, since_us: int | None, until_us: int | Non
         query = query.where(run.c.at_us >= since_us)
     if until_us is not None:
         query = query.where(run.c.at_us < until_us)
-    engine = postgresql_engine(url)
+    engine = postgresql_engine(url, named)
     try:
         with answering(), engine.connect() as connection:
             if not inspect(connection).has_table("run"):

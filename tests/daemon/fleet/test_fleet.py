@@ -14,9 +14,11 @@ import pytest
 
 from tests.daemon.fleet.worlds import certificate, line, outcome, write
 from triaxcald.cli.commands import main
+from triaxcald.cli.fleet import _shown
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError
 from triaxcald.fleet import COLUMNS, Asked, Selection, fleet_document, fleets_of, read_runs, table_rows
+from triaxcald.fleet.page import last_move, notices, percent, worst_study
 from triaxcald.fleet.reading import certified_in
 from triaxcald.recording.reader import Recording
 from triaxcald.schema.fleet import FleetDocument
@@ -88,6 +90,13 @@ def test_runs_are_chosen_by_time_and_place(lined: Path) -> None:
     assert document_of(lined, equal={"serial": "5003"})["runs"] == 3
 
 
+@pytest.mark.parametrize("asked", ["5003", "005003"])
+def test_a_serial_number_is_one_with_and_without_leading_zeros(tmp_path: Path, asked: str) -> None:
+    write(tmp_path, [outcome(serial, day, FIGURES) for day, serial in enumerate(("5003", "005003", "50030"))])
+    found = document_of(tmp_path, equal={"serial": asked})
+    assert (found["units"], found["runs"]) == (1, 2)
+
+
 def test_runs_that_measured_nothing_and_copies_do_not_count(tmp_path: Path) -> None:
     one = outcome("1", 0, FIGURES)
     aborted = outcome("2", 1, FIGURES) | {"verdict": "aborted", "code": "no_poses", "measured": None}
@@ -118,10 +127,15 @@ def test_a_certificate_is_cut_out_as_it_would_be_parsed() -> None:
         certified_in("{}")
 
 
-def test_a_damaged_certificate_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "damaged",
+    ["{", '{\n  "result": {\n    "findings": ' + "[" * 200_000, '{"result": ' * 200_000],
+    ids=["cut", "part", "whole"],
+)
+def test_a_damaged_certificate_is_named(tmp_path: Path, damaged: str) -> None:
     write(tmp_path, [outcome("1", 0, FIGURES), outcome("2", 1, FIGURES)], [certificate(0.5)] * 2)
     broken = sorted(tmp_path.glob("*.certificate.json"))[0]
-    broken.write_text("{")
+    broken.write_text(damaged)
     assert document_of(tmp_path)["skipped"] == [broken.name]
 
 
@@ -146,6 +160,79 @@ def test_a_gauge_study_by_fixture_finds_its_size(product: dict[str, Any]) -> Non
     assert of["components"]["reproducibility"]["sd"] == pytest.approx(8e-3 / np.sqrt(3), rel=0.1)
     assert of["components"]["repeatability"]["sd"] == pytest.approx(3e-5, rel=0.4)
     assert figure(product, "bias_x")["gauge"][0]["grr"] < 0.03
+
+
+@pytest.mark.parametrize("verdict", ["aborted", "fail"])
+def test_a_run_that_failed_is_in_no_gauge_study_and_no_drift(tmp_path: Path, verdict: str) -> None:
+    documents = line(40, repeats=4, shift=0.0)
+    clean = document_of(write(tmp_path / "clean", documents), Asked(limit_g=0.02))["products"][0]
+    mine = [d for d in documents if d["serial"] == "5000"]
+    last = json.loads(json.dumps(mine[-1]))
+    last |= {"verdict": verdict, "code": "implausible", "run": "another", "ended": "2027-01-30T08:00:00.000+00:00"}
+    last["measured"]["calibration"]["bias"][0] += 0.5
+    of = document_of(write(tmp_path / "with", [*documents, last]), Asked(limit_g=0.02))["products"][0]
+    assert (clean["left_out"], of["left_out"]) == (0, 1)
+    for key in ("gauge", "drift"):
+        assert figure(of, "bias_x")[key] == figure(clean, "bias_x")[key]
+    assert of["recalibration"] == clean["recalibration"]
+    # The coefficients of a failed unit are its own; of a stopped run nobody knows what was measured.
+    same = figure(of, "bias_x")["distribution"] == figure(clean, "bias_x")["distribution"]
+    assert same == (verdict == "aborted")
+
+
+def test_an_aborted_run_stands_for_a_unit_without_another(tmp_path: Path) -> None:
+    alone = outcome("1", 0, FIGURES) | {"verdict": "aborted", "code": "implausible"}
+    (of,) = document_of(write(tmp_path, [alone, outcome("2", 1, FIGURES)]))["products"]
+    assert figure(of, "bias_x")["n"] == 2
+
+
+def test_of_a_unit_with_many_runs_a_gauge_study_takes_pairs(tmp_path: Path) -> None:
+    documents = line(6, repeats=70, repeated=6, shift=0.0)
+    (of,) = document_of(write(tmp_path, documents), Asked(limit_g=0.02))["products"]
+    assert of["runs"] == 420
+    (study,) = [study for study in figure(of, "bias_x")["gauge"] if study["factor"] is None]
+    assert 6 * 40 < study["measurements"] <= 6 * 50
+    assert study["components"]["repeatability"]["sd"] == pytest.approx(3e-5, rel=0.2)
+    assert figure(of, "bias_x")["drift"]["span_days"] > 1000
+
+
+def test_a_group_that_was_not_compared_is_not_the_farthest(tmp_path: Path) -> None:
+    documents = line()
+    odd = json.loads(json.dumps(documents[-1]))
+    odd |= {"serial": "9", "run": "odd"}
+    odd["work"] |= {"serial": "9", "fixture": "F9"}
+    odd["measured"]["calibration"]["bias"][1] += 0.5
+    (of,) = document_of(write(tmp_path, [*documents, odd]))["products"]
+    by = next(c for c in figure(of, "bias_y")["comparisons"] if c["factor"] == "fixture")
+    assert max(by["groups"], key=lambda g: abs(g["apart"]))["name"] == "F9"
+    assert any("Bias y differs by fixture, most at F2" in text for text in notices(of))
+
+
+def test_a_mean_is_said_to_move_only_where_more_signals_come_than_by_chance(tmp_path: Path) -> None:
+    documents = line(200, repeated=0, shift=0.0)
+    few = document_of(write(tmp_path / "few", documents))["products"][0]
+    charts = [f["charts"] for f in few["figures"] if f["charts"] and f["charts"]["cusum"]["count"]]
+    assert charts
+    assert [last_move(c) for c in charts] == [None] * len(charts)
+    for d in documents[100:]:
+        d["measured"]["calibration"]["bias"][0] += 0.02
+    (moved,) = document_of(write(tmp_path / "moved", documents))["products"]
+    last = last_move(figure(moved, "bias_x")["charts"])
+    assert last is not None
+    assert any(f"the mean last moved about {last['time'][:10]}" in text for text in notices(moved))
+
+
+def test_the_console_has_the_gauge_figure_of_the_page(
+    lined: Path, product: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    of = figure(product, "bias_y")
+    alone, worst = of["gauge"][0]["grr"], worst_study(of)
+    assert worst is not None
+    assert worst["grr"] != alone
+    assert main(["fleet", str(lined), "--limit", "0.02"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any("Bias y" in text and "fixture" in text and percent(worst["grr"]) in text for text in lines)
+    assert not any("Bias y" in text and percent(alone) in text for text in lines)
 
 
 def test_charts_state_their_run_lengths(product: dict[str, Any]) -> None:
@@ -266,6 +353,23 @@ def test_wrong_options_are_refused(lined: Path, wrong: list[str]) -> None:
     assert main(["fleet", str(lined), *wrong]) == 2
 
 
+@pytest.mark.parametrize(
+    "url", ["postgresql://u:hidden@h:abc/x", "postgresql://u:hidden@[::1/x", "mysql://u:hidden@h/x", "no url://hidden"]
+)
+def test_a_wrong_address_of_a_database_is_bad_input(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fleet", url]) == 2
+    told = capsys.readouterr().err
+    assert "the database: expected" in told
+    assert "hidden" not in told
+
+
+def test_a_database_is_shown_without_its_password() -> None:
+    shown = _shown("postgresql://u:hidden@[::1]:5432/line?password=hidden&sslmode=require")
+    assert (shown, _shown("sqlite:///a?b"), _shown("folder")) == (
+        "postgresql://u:***@[::1]:5432/line", "sqlite:///a?b", "folder",
+    )  # fmt: skip
+
+
 def test_an_empty_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fleet", str(tmp_path)]) == 2
     assert "no run has measured anything" in capsys.readouterr().err
@@ -284,6 +388,8 @@ def test_a_fixture_that_shifts_a_bias_is_named(tmp_path: Path, capsys: pytest.Ca
         "fixture", "F2", None, "a shift of bias.y",
     )  # fmt: skip
     assert place["probability"] > 0.99
+    assert (place["verdict"], place["until"], place["since_interval"]) == ("named", None, None)
+    assert [(p["kind"], p["name"]) for p in place["places"]] == [("fixture", "F2")]
     assert place["text"] in page.read_text(encoding="utf-8")
 
 

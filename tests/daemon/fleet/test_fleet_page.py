@@ -10,8 +10,8 @@ import pytest
 
 from tests.daemon.fleet.worlds import certificate, line, write
 from triaxcald.fleet import Asked, Selection, fleet_document, fleets_of, read_runs, render_fleet
-from triaxcald.fleet.page import drift_table, gauge_table, lasting, notices
-from triaxcald.fleet.places import Placed
+from triaxcald.fleet.page import acting, drift_table, gauge_table, lasting, notices
+from triaxcald.fleet.places import Placed, PlaceOfEffect
 from triaxcald.schema.fleet import FleetDocument
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -19,18 +19,42 @@ pytestmark = pytest.mark.slow
 
 
 PLACED = [
-    Placed("hour", "14-18", None, "bias_x", 0.6, "0.1 mg", "The bias of x is higher in the afternoon."),
-    Placed("fixture", "F2 <b>", "2026-03-02", "bias_y", 0.998, "4.0(2) mg", "Fixture F2 shifts the bias of y."),
+    Placed(
+        "candidate",
+        (PlaceOfEffect("hour", "14-18", 1.0),),
+        None,
+        None,
+        None,
+        "bias_x",
+        0.6,
+        "0.1 mg",
+        "The bias of x is higher in the afternoon.",
+    ),
+    Placed(
+        "confounded",
+        (PlaceOfEffect("fixture", "F2 <b>", 0.7), PlaceOfEffect("station", "S1", 0.3)),
+        "2026-03-02",
+        ("2026-03-01", "2026-03-04"),
+        "2026-06-01",
+        "bias_y",
+        0.998,
+        "4.0(2) mg",
+        "Fixture F2 shifts the bias of y.",
+    ),
 ]
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+def lined(tmp_path_factory: pytest.TempPathFactory) -> Path:
     documents = line()
     for document in documents[:3]:
         document["work"]["batch"] = '<script>alert("x")</script>'
-    folder = write(tmp_path_factory.mktemp("line"), documents, [certificate(0.9)] * len(documents))
-    runs = read_runs(str(folder), Selection())
+    return write(tmp_path_factory.mktemp("line"), documents, [certificate(0.9)] * len(documents))
+
+
+@pytest.fixture(scope="module")
+def page(lined: Path) -> tuple[dict, str]:
+    runs = read_runs(str(lined), Selection())
     fleets = fleets_of(runs)
     made = fleet_document(fleets, "<out>", runs.skipped, Asked(limit_g=0.02), lambda _: PLACED)
     document = FleetDocument.model_validate(made).document()
@@ -67,17 +91,42 @@ def test_effects_of_places_come_with_the_most_probable_first(page: tuple[dict, s
     assert page[1].index("Fixture F2 shifts the bias of y.") < page[1].index("The bias of x is higher")
 
 
-def test_the_same_fleet_gives_the_same_bytes(page: tuple[dict, str]) -> None:
+def test_a_place_is_shown_with_its_verdict_its_rivals_and_its_end(page: tuple[dict, str]) -> None:
+    (product,) = page[0]["products"]
+    confounded, candidate = product["places"]
+    assert (confounded["kind"], confounded["place"], confounded["verdict"]) == ("fixture", "F2 <b>", "confounded")
+    assert [(p["kind"], p["name"], p["probability"]) for p in confounded["places"]] == [
+        ("fixture", "F2 <b>", 0.7), ("station", "S1", 0.3),
+    ]  # fmt: skip
+    assert (candidate["verdict"], candidate["until"]) == ("candidate", None)
+    for words in (
+        "Fixture F2 &lt;b&gt; or station S1", "from 2026-03-02 (95 %: 2026-03-01 to 2026-03-04) until 2026-06-01",
+        "Hours 14-18 UTC", "always", 'class="finding confounded"', 'class="finding"',
+    ):  # fmt: skip
+        assert words in page[1]
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "said"),
+    [(None, None, "always"), (None, "b", "until b"), ("a", None, "since a"), ("a", "b", "from a until b")],
+)
+def test_the_time_of_an_effect_has_its_ends(since: str | None, until: str | None, said: str) -> None:
+    assert acting({"since": since, "since_interval": None, "until": until}) == said
+
+
+def test_the_same_fleet_gives_the_same_bytes(page: tuple[dict, str], lined: Path) -> None:
     document, text = page
+    fleets = fleets_of(read_runs(str(lined), Selection()))
     again = FleetDocument.model_validate(document).document()
     assert again == document
+    assert render_fleet(again, fleets) == text
     assert text.count("<figure>") == text.count("</figure>")
 
 
 def test_notices_name_the_fixture_and_the_gauge(page: tuple[dict, str]) -> None:
     told = list(notices(page[0]["products"][0]))
     assert any("Bias y differs by fixture, most at F2" in text for text in told)
-    assert any("Bias y: the measurement makes" in text and "fixture" in text for text in told)
+    assert any("Bias y: %GRR" in text and "by fixture (above 30 %: not acceptable, AIAG)" in text for text in told)
 
 
 def test_tables_have_a_row_a_coefficient(page: tuple[dict, str]) -> None:

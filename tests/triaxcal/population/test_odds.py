@@ -116,7 +116,8 @@ def test_diagnose_takes_odds_as_they_are_as_a_document_and_as_a_file(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_loop_document_says_what_its_loop_says() -> None:
+@pytest.mark.parametrize("channels", [{"temp_c": 22 + 0.01 * np.arange(26)}, {}], ids=["temperature", "none"])
+def test_a_loop_document_says_what_its_loop_says(channels: dict[str, np.ndarray]) -> None:
     up = np.array([v for _, v in tc.planning.directions(26)], dtype=float)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     rng = np.random.default_rng(4)
@@ -125,12 +126,13 @@ def test_a_loop_document_says_what_its_loop_says() -> None:
         u,
         t=12.0 * np.arange(26),
         standard_errors=np.full(u.shape, 0.05),
-        channels={"temp_c": 22 + 0.01 * np.arange(26)},
+        channels=channels,
     )
     loop = tc.diagnosis.diagnose(poses)
     document = loop_document(loop, output_unit="counts")
     by_loop, by_document = SeenUnit.of(loop), tc.interchange.seen_unit_in(document, where="x")
     for name, seen in by_loop.effects.items():
+        assert by_document.effects[name].prior_odds == pytest.approx(seen.prior_odds)
         other = by_document.effects[name].probability
         if seen.probability is None or other is None:
             assert seen.probability is other
@@ -141,6 +143,16 @@ def test_a_loop_document_says_what_its_loop_says() -> None:
     assert run.poses is not None
     assert run.poses.planned is not None
     assert np.allclose(np.sum(run.poses.planned * run.poses.measured, axis=1), 1, atol=1e-3)
-    assert run.effects["second_order_nonlinearity"].probability == pytest.approx(1.0, abs=0.01)
+    # What effects are likely is the loop's to say: the run has the same of it.
+    assert {name: (seen.probability, seen.prior_odds) for name, seen in run.effects.items()} == {
+        name: (seen.probability, seen.prior_odds) for name, seen in by_document.effects.items()
+    }
+    assert by_document.effects["second_order_nonlinearity"].probability == pytest.approx(
+        by_loop.effects["second_order_nonlinearity"].probability, abs=2e-3
+    )
+    assert (
+        by_document.effects["second_order_nonlinearity"].probability
+        > 10 * by_document.effects["hysteresis"].probability
+    )
     with pytest.raises(tc.InvalidData):
         tc.interchange.seen_unit_in({"format": "triaxcal.poses/1"}, where="x")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
 from triaxcal.population import Change, Form, Pattern, Place, PlacedEffects, PlaceKind, Statement, Verdict
 from triaxcal.population.figures import FigureKind
 from triaxcal.population.hypotheses import COMMON_FACTOR, SEVERAL, THERMOMETER
-from triaxcal.text.population import line, lines, pattern, place
+from triaxcal.text.population import line, lines, pattern, place, sizes
 
 
 def day(seconds: float) -> str:
@@ -30,6 +31,29 @@ def test_a_line_has_places_time_pattern_size_and_number_of_runs() -> None:
         assert words in text
     assert "0.83" in line(statement(Verdict.CANDIDATE), day)
     assert "0.83" not in text
+
+
+def of(pattern: Pattern, unit: str) -> str:
+    change = Change(0.0384, 0.0055, unit, 3.1)
+    return sizes(replace(statement(), patterns={pattern: 1.0}, sizes={pattern.name: change}))
+
+
+def test_sizes_are_factors_shares_and_per_cent() -> None:
+    kind = FigureKind.COEFFICIENTS
+    assert of(Pattern(Form.SHIFT, kind, "coefficients", "scale_factor.x"), "") == "scale_factor.x 3.84 ± 0.55 %"
+    assert of(Pattern(Form.DRIFT, kind, "coefficients", COMMON_FACTOR), "") == "common factor 3.84 ± 0.55 %"
+    assert of(Pattern(Form.SHIFT, kind, "coefficients", "bias.y"), "g") == "bias.y 0.0384 ± 0.0055 g"
+    assert of(Pattern(Form.SCATTER, kind, "coefficients", "bias.y"), "1") == "scatter 0.0384 ± 0.0055 times as large"
+    assert (
+        of(Pattern(Form.FREQUENCY, FigureKind.EFFECT, "hysteresis", "hysteresis"), "1") == "in 3.84 ± 0.55 % of units"
+    )
+    assert of(Pattern(Form.SHIFT, FigureKind.EFFECT, "hysteresis", "x"), "") == "x 0.0384 ± 0.0055"
+
+
+def test_hours_are_utc_and_a_change_has_its_interval() -> None:
+    assert place(Place(PlaceKind.HOUR, "14-18")) == "hours 14-18 UTC"
+    changed = replace(statement(since_s=8.64e6), since_interval_s=(8.5e6, 8.8e6))
+    assert "since day 100 (95 %: day 98 to day 102):" in line(changed, day)
 
 
 def test_statements_come_before_candidates() -> None:
