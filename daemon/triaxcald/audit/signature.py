@@ -17,10 +17,10 @@ import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.documents import json_value
 from triaxcald.errors import InputError
-from triaxcald.outcome import RUN_RECORD
+from triaxcald.outcome import RUN_RECORD, Verdict
 from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.manifest import End
-from triaxcald.recording.schema import SIGNATURE_FILE, STATION_FILE
+from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE, STATION_FILE
 from triaxcald.recording.survey import Survey
 from triaxcald.signing import chain, stamps
 from triaxcald.signing.envelope import MANIFEST_TYPE, MEDIA_TYPE, Envelope, NotAnEnvelope, parse_envelope, payload_of
@@ -73,7 +73,8 @@ class Signature:
     it gives itself; ``signed`` the station's own time. ``number``, ``digest`` and
     ``previous`` are the place in the chain. ``stamp`` is None where no time stamp was
     asked for. ``older``: not signed, and from before the trust file. ``trust`` is the
-    path of that file, None without one."""
+    path of that file, None without one. ``mended``: a later start signed what an
+    earlier run had left, and knows no more of it than what is in the file."""
 
     state: State
     key: str | None = None
@@ -85,6 +86,7 @@ class Signature:
     stamp: Stamp | None = None
     older: bool = False
     trust: str | None = None
+    mended: bool = False
 
     def document(self) -> dict[str, Any]:
         stamp = self.stamp
@@ -105,6 +107,7 @@ class Signature:
             },
             "older": self.older,
             "trust": self.trust,
+            "mended": self.mended,
         }
 
 
@@ -229,7 +232,13 @@ def _signed(data: bytes, found: Survey, trust: Trust | None, policy: Policy) -> 
     ended = moment(said.get("ended"))
     if (signed := moment(claims.signed)) is None or (ended is not None and signed < ended - CLOCK):
         differences.append(_of(Kind.CLOCK, "signed", stored=claims.signed, again=said.get("ended")))
-    return replace(judged.signature, state=state), differences
+    # Anybody can leave a recording without its end for the next start to mend and sign.
+    # A run that was killed has aborted; any other verdict may be somebody else's.
+    mended, verdict = RECOVERY_RECORD in found.closing, said.get("verdict")
+    vouched = mended and state is State.TRUSTED and verdict != Verdict.ABORTED.value
+    if vouched and not policy.allow_unsigned:
+        differences.append(_of(Kind.MENDED, "verdict", stored=verdict, again=Verdict.ABORTED.value))
+    return replace(judged.signature, state=state, mended=mended), differences
 
 
 @dataclass(frozen=True)
