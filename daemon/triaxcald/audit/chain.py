@@ -3,7 +3,8 @@ off, copied, or closed out of its time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +18,7 @@ from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE
 from triaxcald.signing import chain
-from triaxcald.signing.chain import Entry, EntryKind, Start, Tombstone
+from triaxcald.signing.chain import Entry, EntryKind, Memory, Start, Tombstone
 from triaxcald.signing.envelope import MANIFEST_TYPE, Envelope, NotAnEnvelope, parse_envelope, payload_of
 from triaxcald.signing.keys import FOLDER
 from triaxcald.signing.manifest import Claims, claims_of
@@ -76,10 +77,51 @@ def audit_chain(folder: Path, policy: Policy = Policy(), head: str | None = None
 
 
 def chains_in(folder: Path) -> list[Path]:
-    """The folder with its own chain, or those below it that have one; the folder itself
-    where there is none."""
-    below = sorted(path.parent for path in folder.rglob(chain.NAME))
-    return below or [folder]
+    """The folder and those below it that have a chain. The folder itself is among them
+    where there is none at all, and where a chain is missing: signed recordings are of
+    none, or a key remembers one that is gone."""
+    below = sorted({path.parent for path in folder.rglob(chain.NAME)})
+    if below and folder not in below and not _lacks_chain(folder, below):
+        return below
+    return [folder, *(path for path in below if path != folder)]
+
+
+def _lacks_chain(folder: Path, chains: Sequence[Path]) -> bool:
+    if forgotten(folder):
+        return True
+    if any(_outside(folder, f"*.{SIGNATURE_FILE}", chains)):
+        return True
+    return any(chain.is_signed(path) for path in _outside(folder, "*.mcap", chains))
+
+
+def _outside(folder: Path, pattern: str, chains: Iterable[Path]) -> Iterator[Path]:
+    """Files below the folder that are in none of these."""
+    others = set(chains)
+    return (path for path in sorted(folder.rglob(pattern)) if not others & set(path.parents))
+
+
+def forgotten(folder: Path) -> list[Memory]:
+    """What keys in the folder, below and above it remember of chains in it that are
+    not there."""
+    here = folder.resolve()
+    keys = [*(path for path in folder.rglob(FOLDER)), *(path / FOLDER for path in (here, *here.parents))]
+    known = {memory.path.resolve(): memory for at in keys for memory in chain.memories(at)}
+    missing = [m for m in known.values() if _is_below(m.of, here) and not (Path(m.of) / chain.NAME).exists()]
+    if not missing:
+        return []
+    starts = [_start_of(path) for path in folder.rglob(chain.NAME)]  # it may have been moved with its folder
+    return [m for m in missing if not any(start and start[:16] in m.path.name for start in starts)]
+
+
+def _is_below(of: str, folder: Path) -> bool:
+    return Path(of).is_absolute() and Path(of).is_relative_to(folder)
+
+
+def _start_of(path: Path) -> str | None:
+    """The digest of a chain's first entry; None without one."""
+    with suppress(InputError, NotAnEnvelope, IndexError):
+        return chain.entry_of(chain.read_lines(path)[0]).digest
+    return None
 
 
 @dataclass
@@ -94,8 +136,12 @@ class _ChainAudit:
     def run(self) -> ChainAudit:
         signed, unsigned = self._recordings()
         path = self.folder / chain.NAME
+        missing = forgotten(self.folder)
+        for memory in missing:
+            if Path(memory.of) != self.folder.resolve():
+                self._add(str(Path(memory.of) / chain.NAME), Kind.NO_CHAIN)
         if not path.exists():
-            if not signed:
+            if not (signed or missing or self._below(f"*.{SIGNATURE_FILE}")):
                 raise InputError(f"{self.folder}: no chain of signed recordings ({chain.NAME})")
             self._add(chain.NAME, Kind.NO_CHAIN)
             return ChainAudit(str(self.folder), tuple(self.differences))
@@ -154,7 +200,7 @@ class _ChainAudit:
     def _below(self, pattern: str) -> list[Path]:
         """Files in the folder, but for those of folders with a chain of their own."""
         others = {path.parent for path in self.folder.rglob(chain.NAME)} - {self.folder}
-        return [path for path in sorted(self.folder.rglob(pattern)) if not others & set(path.parents)]
+        return list(_outside(self.folder, pattern, others))
 
     def _entries(self, path: Path) -> list[Entry]:
         """The lines of the chain up to the first that is none."""
@@ -301,9 +347,10 @@ class _ChainAudit:
         if not entries:
             self._add(chain.NAME, Kind.CUT, stored=None, again="a first entry")
             return
-        for folder in (self.folder / FOLDER, self.folder.parent / FOLDER):
-            for known in chain.memories(folder):
-                ours = known.of == str(self.folder.resolve()) or entries[0].digest[:16] in known.path.name
+        here = self.folder.resolve()
+        for folder in (here, *here.parents):
+            for known in chain.memories(folder / FOLDER):
+                ours = known.of == str(here) or entries[0].digest[:16] in known.path.name
                 if ours and known.digest not in digests:
                     self._add(chain.NAME, Kind.CUT, stored=last, again=f"entry {known.number}")
 

@@ -248,6 +248,13 @@ def _claims_of(path: Path, digest: str) -> Claims | None:
     return None
 
 
+def is_signed(path: Path) -> bool:
+    """Whether a finished recording has an attachment in the place of a signature."""
+    with suppress(RecordingError, InputError), Recording.open(path) as recording:
+        return SIGNATURE_FILE in recording.attachments
+    return False
+
+
 def envelope_in(path: Path) -> Envelope | None:
     """That of a finished recording; None without one that can be read."""
     try:

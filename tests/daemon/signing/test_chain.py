@@ -522,3 +522,41 @@ def test_each_chain_below_a_folder_is_its_own(line: Line, keys: Keys) -> None:
     assert chains_in(line.folder.parent) == [line.folder, below]
     assert [audit_chain(folder).differences for folder in chains_in(line.folder)] == [(), ()]
     assert chains_in(below / "nowhere") == [below / "nowhere"]
+
+
+@pytest.mark.parametrize("left", ["recordings", "signatures", "the memory"])
+def test_a_chain_below_does_not_hide_that_the_folder_s_own_is_gone(line: Line, left: str) -> None:
+    below = line.folder / "station-2"
+    below.mkdir()
+    Line(below, line.key, line.now_ns).record("other.mcap")
+    line.record()  # by which the key remembers the folder where it is now
+    (line.folder / chain.NAME).unlink()
+    if left != "recordings":
+        for path in line.folder.glob("*.mcap"):
+            path.unlink()
+    if left == "the memory":
+        for path in line.folder.glob("unit-*"):
+            path.unlink()
+    for asked in (line.folder, line.folder.parent):
+        assert chains_in(asked) == [asked, below]
+        found = {d.kind for folder in chains_in(asked) for d in audit_chain(folder).differences}
+        assert Kind.NO_CHAIN in found
+
+
+def test_a_chain_that_is_elsewhere_is_not_missed_here(line: Line, tmp_path: Path) -> None:
+    """The key also signs in another folder."""
+    (tmp_path / "other").mkdir()
+    Line(tmp_path / "other", line.key, line.now_ns).record("other.mcap")
+    assert chains_in(line.folder) == [line.folder]
+    assert kinds(line) == []
+
+
+def test_what_the_key_remembers_is_looked_for_in_all_folders_above(line: Line, keys: Keys) -> None:
+    runs = line.folder / "a" / "b" / "runs"
+    runs.mkdir(parents=True)
+    other = Line(runs, line.key, line.now_ns)
+    for _ in range(2):
+        other.record()
+    removed(other.made[1])
+    write_lines(runs, lines_of(runs)[:2])
+    assert [d.kind for d in audit_chain(runs).differences] == [Kind.CUT]
