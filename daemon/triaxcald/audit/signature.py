@@ -28,7 +28,7 @@ from triaxcald.signing.keys import key_id, verifies
 from triaxcald.signing.manifest import Claims, claims_of, manifest
 from triaxcald.signing.stamps import Stamp, StampState
 from triaxcald.signing.trust import NAME as TRUST_FILE
-from triaxcald.signing.trust import Trust, load_trust, moment, nearest
+from triaxcald.signing.trust import Rejected, Trust, load_trust, moment, nearest
 
 CLOCK: Final = timedelta(seconds=1)
 """A clock that is corrected by steps may go back by some tenths of a second."""
@@ -49,22 +49,30 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Policy:
-    """What an audit asks of signatures. ``trust`` is the trust file, by default the
-    nearest one above a recording; ``allow_unsigned`` lets recordings pass that are not
-    signed, or not by a trusted key."""
+    """What an audit asks of signatures. ``trust`` is the trust file, by default that
+    of the folder among ``folders`` with the recording, else the nearest one above it;
+    ``allow_unsigned`` lets recordings pass that are not signed, or not by a trusted
+    key. ``folders`` are those that were asked for: a trust file further below, where
+    an audit was not asked to look for one, does not count."""
 
     trust: Path | None = None
     allow_unsigned: bool = False
+    folders: tuple[Path, ...] = ()
 
     def trust_of(self, recording: td.files.AnyPath) -> Trust | None:
-        """In a store only the file that was given counts. Raises InputError."""
+        """In a store only the file that was given counts. Raises InputError; Rejected
+        where the nearest one may be a stranger's."""
         path = self.file_of(recording)
         return None if path is None else load_trust(path)
 
     def file_of(self, recording: td.files.AnyPath) -> Path | None:
         if self.trust is not None or not isinstance(recording, Path):
             return self.trust
-        return nearest(recording.parent, TRUST_FILE)
+        parent = recording.parent.resolve()
+        for folder in self.folders:
+            if parent.is_relative_to(folder.resolve()) and (found := nearest(folder, TRUST_FILE)) is not None:
+                return found
+        return nearest(parent, TRUST_FILE)
 
 
 @dataclass(frozen=True)
@@ -162,7 +170,10 @@ def _is_older(path: td.files.AnyPath, found: Survey, trust: Trust) -> bool:
     last = latest(found)
     if last is None or last >= trust.since or not isinstance(path, Path):
         return False
-    at = nearest(path.parent, chain.NAME)
+    try:
+        at = nearest(path.parent, chain.NAME)
+    except Rejected:
+        return False
     if at is None:
         return True
     start = trusted_start(at, trust)

@@ -178,12 +178,24 @@ def read_private(path: Path, passphrase: bytes | None) -> SigningKey:
 
 
 def private_keys(folder: Path) -> list[Path]:
-    """Files with private keys, by name."""
-    return sorted(folder.glob(f"*{PRIVATE}"))
+    """Files with private keys, by name; none where there is no folder. Raises
+    InputError: a folder that cannot be read is not one without keys."""
+    return _files(folder, PRIVATE)
 
 
 def public_keys(folder: Path) -> list[Path]:
-    return sorted(folder.glob(f"*{PUBLIC}"))
+    """As `private_keys`."""
+    return _files(folder, PUBLIC)
+
+
+def _files(folder: Path, suffix: str) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(folder / entry.name for entry in entries if entry.name.endswith(suffix))
+    except FileNotFoundError:
+        return []
+    except OSError as e:
+        raise InputError(f"{folder}: cannot be read: {e.strerror}") from e
 
 
 def passphrase_of(file: Path | None, environment: Mapping[str, str] = os.environ) -> bytes | None:

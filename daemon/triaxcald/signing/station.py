@@ -27,13 +27,15 @@ from triaxcald.signing.keys import (
     key_id,
     passphrase_of,
     private_keys,
+    public_keys,
     read_private,
     read_public,
     to_text,
     verifies,
 )
 from triaxcald.signing.manifest import Claims, claims_document, manifest
-from triaxcald.signing.trust import Trust, trust_of
+from triaxcald.signing.trust import NAME as TRUST_FILE
+from triaxcald.signing.trust import Trust, load_trust, trust_of
 from triaxcald.station.config import Sign, Station
 from triaxcald.utc import iso_time
 
@@ -170,16 +172,19 @@ def earlier_outcomes(folder: Path) -> list[str]:
 
 
 def signing_of(station: Station) -> StationSigning | None:
-    """What signs the station's recordings, ready for use; None for a station without a
-    key. Raises InputError if it has one that cannot be used."""
-    sign = station.file.sign
-    key = _key_of(station, sign)
+    """What signs the station's recordings, ready for use; None for a station that has
+    neither a key nor anything that shows it signs. Raises InputError if its key is
+    missing, cannot be used, or is not in its trust file."""
+    sign, trust = station.file.sign, _trust_of(station)
+    key = _key_of(station, sign, trust)
     if key is None:
+        _require_never_signed(station, trust)
         return None
-    trust = trust_of(station.folder / "recording")
     known = None if trust is None else trust.key(key.id)
     if known is not None and known.revoked is not None:
         raise InputError(f"key {key.name}: revoked on {known.revoked}; `triaxcal keys new` makes another")
+    if trust is not None and known is None:
+        raise InputError(f"key {key.name}: not in {trust.path}; `triaxcal keys trust {key.name}` enters it")
     url = None if sign is None else sign.timestamp
     if url is not None:
         stamps.require_installed()
@@ -196,14 +201,31 @@ def key_folders(station: Station) -> list[Path]:
     return list(dict.fromkeys((beside / FOLDER, station.folder / FOLDER)))
 
 
+def _trust_of(station: Station) -> Trust | None:
+    """That by which its recordings are audited, else the one beside its file. Raises
+    InputError."""
+    found, beside = trust_of(station.folder / "recording"), station.path.parent / TRUST_FILE
+    return load_trust(beside) if found is None and os.path.lexists(beside) else found
+
+
+def _require_never_signed(station: Station, trust: Trust | None) -> None:
+    """Raises InputError where something says that the station signs."""
+    left = [path for folder in key_folders(station) for path in public_keys(folder)]
+    left += [] if trust is None else [trust.path]
+    left += [path for path in (station.folder / chain.NAME,) if os.path.lexists(path)]
+    if left:
+        told = " or ".join(map(str, key_folders(station)))
+        raise InputError(f"{left[0]}: this station signs its recordings, and there is no private key in {told}")
+
+
 _opened: dict[tuple[str, ...], SigningKey] = {}
 """Keys at work by what opened them: the work of scrypt is done once."""
 
 
-def _key_of(station: Station, sign: Sign | None) -> SigningKey | None:
+def _key_of(station: Station, sign: Sign | None, trust: Trust | None) -> SigningKey | None:
     if sign is not None and sign.pkcs11 is not None:
         return _of_token(station, sign)
-    path = _path_of(station, sign)
+    path = _path_of(station, sign, trust)
     if path is None:
         return None
     passphrase = _passphrase(station, sign)
@@ -234,11 +256,11 @@ def _passphrase(station: Station, sign: Sign | None) -> bytes | None:
     return passphrase_of(file)
 
 
-def _path_of(station: Station, sign: Sign | None) -> Path | None:
+def _path_of(station: Station, sign: Sign | None, trust: Trust | None) -> Path | None:
     folders = key_folders(station)
     if sign is not None and sign.key is not None:
         for folder in folders:
-            if (path := folder / f"{sign.key}{PRIVATE}").exists():
+            if (path := folder / f"{sign.key}{PRIVATE}") in private_keys(folder):
                 return path
         told = " or ".join(map(str, folders))
         raise InputError(f"{station.path}: sign.key: there is no {sign.key}{PRIVATE} in {told}")
@@ -247,7 +269,12 @@ def _path_of(station: Station, sign: Sign | None) -> Path | None:
         told = " or ".join(map(str, folders))
         raise InputError(f"{station.path}: sign: there is no key in {told}; `triaxcal keys new NAME` makes one")
     if len(found) > 1:
-        found = [path for path in found if not _revoked(path, trust_of(station.folder / "recording"))]
+        good = [path for path in found if not _revoked(path, trust)]
+        if not good:
+            raise InputError(
+                f"{found[0].parent}: each of its {len(found)} keys is revoked; `triaxcal keys new` makes another"
+            )
+        found = good
     if len(found) > 1:
         names = ", ".join(path.stem for path in found)
         raise InputError(f'{station.path}: sign.key: name one of {names}, as in [sign] key = "{found[0].stem}"')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import stat
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from triaxcald.audit import Policy
 from triaxcald.cli.commands import main
 from triaxcald.errors import InputError
 from triaxcald.signing.keys import (
@@ -193,6 +195,38 @@ def test_the_trust_file_is_that_of_the_nearest_folder(tmp_path: Path) -> None:
     assert found.since.isoformat() == "2026-01-01T00:00:00+00:00"
     assert nearest(within / "not" / "there", "trust.toml") == found.path
     assert nearest(tmp_path, "no such file") is None
+
+
+TRUST = 'format = "triaxcal.trust/1"\nsince = 2026-01-01T00:00:00Z\n'
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="gives files to other users")
+def test_above_a_folder_the_trust_file_is_root_s_the_user_s_or_the_owner_s(tmp_path: Path) -> None:
+    within = tmp_path / "station"
+    within.mkdir()
+    file = tmp_path / "trust.toml"
+    file.write_text(TRUST)
+    for folder, owner in ((0, 0), (4711, 0), (4711, 4711)):
+        os.chown(within, folder, -1)
+        os.chown(file, owner, -1)
+        assert Policy().trust_of(within / "a.mcap") is not None
+    os.chown(file, 4712, -1)
+    with pytest.raises(InputError, match="--trust"):  # it is there, so it is not as if there were none
+        Policy().trust_of(within / "a.mcap")
+    assert Policy(trust=file).trust_of(within / "a.mcap") is not None
+    (within / "trust.toml").write_text(TRUST)
+    assert nearest(within, "trust.toml") == within / "trust.toml"
+
+
+def test_the_trust_file_of_the_folder_asked_for_counts_for_all_below(tmp_path: Path) -> None:
+    within = tmp_path / "station" / "2026"
+    within.mkdir(parents=True)
+    for folder in (tmp_path / "station", within):
+        (folder / "trust.toml").write_text(TRUST)
+    recording = within / "a.mcap"
+    assert Policy().file_of(recording) == within / "trust.toml"
+    assert Policy(folders=(tmp_path / "station",)).file_of(recording) == tmp_path / "station" / "trust.toml"
+    assert Policy(folders=(tmp_path,)).file_of(recording) == within / "trust.toml"  # it has none itself
 
 
 @pytest.mark.parametrize(("module", "extra"), [("cryptography", "sign"), ("pkcs11", "hsm"), ("rfc3161_client", "sign")])

@@ -27,6 +27,7 @@ from triaxcald.run.attempts import Attempts, settle_killed
 from triaxcald.signing import chain
 from triaxcald.signing.keys import PASSPHRASE, SigningKey, new_key
 from triaxcald.signing.station import signing_of
+from triaxcald.signing.trust import trust_key
 from triaxcald.station.config import Station, load_station
 from triaxcald.work import Attempt, Work
 
@@ -67,7 +68,10 @@ def test_of_several_keys_the_station_file_names_one_or_one_is_not_revoked(
     found = signing_of(station(key="line-1"))
     assert found is not None
     assert found.key.public == keys[0].public
-    trusted(workshop.folder, when(T0_NS), keys[0], revoked=when(T0_NS), reason="replaced", retired=True)
+    path = trusted(workshop.folder, when(T0_NS), keys[0], revoked=when(T0_NS), reason="replaced", retired=True)
+    with pytest.raises(InputError):  # the trust file lacks the other
+        signing_of(station())
+    trust_key(path.parent, "line-2", keys[1].public)
     found = signing_of(station())
     assert found is not None
     assert found.key.public == keys[1].public
@@ -116,6 +120,34 @@ def _two(folder: Path) -> None:
         new_key(folder / "keys", name, None)
 
 
+def _each_revoked(folder: Path) -> None:
+    keys = [new_key(folder / "keys", name, None) for name in ("line-1", "line-2")]
+    trusted(folder, when(T0_NS), *keys, revoked=when(T0_NS), reason="stolen")
+
+
+def _no_folder(folder: Path) -> None:
+    (folder / "keys").write_text("a file")
+
+
+def _only_trust(folder: Path) -> None:
+    key = new_key(folder / "elsewhere", "line-1", None)
+    trusted(folder, when(T0_NS), key)
+
+
+def _only_chain(folder: Path) -> None:
+    Line(folder, new_key(folder / "elsewhere", "line-1", None)).record()
+
+
+def _only_public(folder: Path) -> None:
+    new_key(folder / "keys", "line-1", None)
+    (folder / "keys" / "line-1.key").unlink()
+
+
+def _not_in_trust(folder: Path) -> None:
+    new_key(folder / "keys", "line-1", None)
+    trusted(folder, when(T0_NS), new_key(folder / "elsewhere", "line-2", None))
+
+
 CANNOT: list[tuple[str, Callable[[Path], object], dict[str, Any]]] = [
     ("passphrase missing", _encrypted, {}),
     ("passphrase wrong", _encrypted, {"passphrase_file": "wrong"}),
@@ -126,6 +158,12 @@ CANNOT: list[tuple[str, Callable[[Path], object], dict[str, Any]]] = [
     ("key missing", lambda _: None, {"key": "line-9"}),
     ("no key at all", lambda _: None, {"timestamp": "http://127.0.0.1:1/"}),
     ("two keys", _two, {}),
+    ("each key revoked", _each_revoked, {}),
+    ("keys is no folder", _no_folder, {}),
+    ("no private key, and a trust file", _only_trust, {}),
+    ("no private key, and a chain", _only_chain, {}),
+    ("no private key, and a public one", _only_public, {}),
+    ("key not in the trust file", _not_in_trust, {}),
     ("trust file unusable", _no_trust, {}),
     ("chain garbled", _garbled_chain, {}),
     ("device absent", lambda _: None, {"key": "line-1", "pkcs11": {"module": "/none.so", "token": "station"}}),
