@@ -69,6 +69,10 @@ class _Signed:
         return chain.digest_of(self.envelope.payload)
 
 
+Tombstones = set[tuple[str, str | None]]
+"""Digests, as `Tombstone` has them, each with the name of the recording."""
+
+
 def audit_chain(folder: Path, policy: Policy = Policy(), head: str | None = None) -> ChainAudit:  # noqa: B008 - frozen
     """``head`` is the digest of an entry that the chain is known to have had. Raises
     InputError for a folder without a chain or a signed recording, and for an unusable
@@ -220,9 +224,9 @@ class _ChainAudit:
 
     # Signatures and links.
 
-    def _said(self, entries: Sequence[Entry]) -> tuple[Start | None, dict[str, Tombstone]]:
+    def _said(self, entries: Sequence[Entry]) -> tuple[Start | None, Tombstones]:
         """What start and tombstones say, if their signatures hold."""
-        start, tombstones, before = None, dict[str, Tombstone](), ""
+        start, tombstones, before = None, Tombstones(), ""
         for entry in entries:
             if entry.envelope is not None:
                 try:
@@ -236,7 +240,7 @@ class _ChainAudit:
                     elif good and isinstance(said, Start):
                         start = said
                     elif good and isinstance(said, Tombstone):
-                        tombstones[said.of] = said
+                        tombstones.add((said.of, said.recording))
             before = entry.digest
         return start, tombstones
 
@@ -280,7 +284,7 @@ class _ChainAudit:
 
     # Recordings that are missing, or too many.
 
-    def _removed(self, entries: Sequence[Entry], tombstones: dict[str, Tombstone], signed: Sequence[_Signed]) -> None:
+    def _removed(self, entries: Sequence[Entry], tombstones: Tombstones, signed: Sequence[_Signed]) -> None:
         there: dict[str, list[_Signed]] = {}
         for one in signed:
             there.setdefault(one.digest, []).append(one)
@@ -288,7 +292,7 @@ class _ChainAudit:
             if entry.kind is not EntryKind.RECORDING:
                 continue
             found = sorted(there.get(entry.digest, []), key=lambda one: one.path.name != one.name)
-            if not found and entry.digest not in tombstones:
+            if not found and (entry.digest, entry.recording) not in tombstones:
                 self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
             for other in found[1:]:
                 self._add(other.path.name, Kind.COPIED, again=str(found[0].path))
@@ -321,7 +325,7 @@ class _ChainAudit:
                 self._add(path.name, Kind.INSERTED, again="not signed, and not there when the chain began")
         return earlier
 
-    def _sidecars(self, tombstones: dict[str, Tombstone]) -> None:
+    def _sidecars(self, tombstones: Tombstones) -> None:
         """A signature beside no recording, which only a recording that was removed
         leaves."""
         for path in self._below(f"*.{SIGNATURE_FILE}"):
@@ -330,11 +334,12 @@ class _ChainAudit:
                 continue
             try:
                 envelope = parse_envelope(path.read_bytes())
-                number: int | str = claims_of(payload_of(envelope, MANIFEST_TYPE)).number
+                said = payload_of(envelope, MANIFEST_TYPE)
+                number: int | str = claims_of(said).number
             except (OSError, NotAnEnvelope):
                 self._add(recording.name, Kind.REMOVED, again="unknown")
                 continue
-            if chain.digest_of(envelope.payload) not in tombstones:
+            if (chain.digest_of(envelope.payload), said.get("recording")) not in tombstones:
                 self._add(recording.name, Kind.REMOVED, again=number)
 
     # The end.

@@ -27,6 +27,7 @@ from typing import Any, Final
 from triaxcald.documents import json_value
 from triaxcald.errors import DiskError, InputError, NotSigned, RecordingError
 from triaxcald.files import is_of_the_disk, synchronise, write_durably
+from triaxcald.recording.manifest import SealedContents
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.signing.envelope import CHAIN_TYPE, Envelope, NotAnEnvelope, envelope_of, parse_envelope, payload_of
@@ -245,6 +246,13 @@ def _claims_of(path: Path, digest: str) -> Claims | None:
         return None
     with suppress(NotAnEnvelope):
         return claims_in(envelope)
+    return None
+
+
+def recording_in(contents: SealedContents) -> str | None:
+    """The name of the file, by its outcome."""
+    with suppress(ValueError, LookupError, TypeError, RecursionError):
+        return str(json_value(contents.document)["recording"])
     return None
 
 

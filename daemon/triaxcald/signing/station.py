@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from triaxcald.documents import json_value
 from triaxcald.errors import DaemonError, DiskError, InputError, NotSigned
 from triaxcald.outcome import SUFFIX
 from triaxcald.outcome import digest_of as outcome_digest
@@ -59,7 +58,7 @@ class StationSigning:
             payload = manifest(contents, claims)
             envelope = self._envelope(MANIFEST_TYPE, payload, stamped=True)
             name = str(contents.metadata.get("run", {}).get("run", ""))
-            recording = _recording_in(contents) or name
+            recording = chain.recording_in(contents) or name
             entry = Entry(EntryKind.RECORDING, claims.number, chain.digest_of(payload), recording)
             open_chain.note(recording, entry.digest)
             try:
@@ -150,13 +149,6 @@ class StationSigning:
             raise InputError(f"{self.folder / chain.NAME}: cannot be written: {e.strerror}") from e
         except DaemonError as e:
             raise InputError(f"this station signs its recordings, and cannot: {e}") from e
-
-
-def _recording_in(contents: SealedContents) -> str | None:
-    """The name of the file, by its outcome."""
-    with suppress(ValueError, LookupError, TypeError, RecursionError):
-        return str(json_value(contents.document)["recording"])
-    return None
 
 
 def earlier_outcomes(folder: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -13,11 +14,13 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import Workshop
 from tests.daemon.audit.forging import Forgery
 from tests.daemon.signing.conftest import trusted
 from tests.daemon.signing.line import (
     SECOND_NS,
     Line,
+    batch,
     lines_of,
     looked_at,
     outcome_digest,
@@ -28,12 +31,19 @@ from tests.daemon.signing.line import (
 from triaxcald.audit import Policy, audit_chain, chains_in
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State
-from triaxcald.errors import InputError, NotSigned
+from triaxcald.cli.commands import main
+from triaxcald.errors import DiskError, InputError, NotSigned
 from triaxcald.outcome import ATTACHMENT
+from triaxcald.recording import disk
+from triaxcald.recording.manifest import Retention
 from triaxcald.recording.schema import SIGNATURE_FILE
+from triaxcald.recording.segments import SegmentedWriter
+from triaxcald.run.attempts import Attempts
 from triaxcald.signing import chain
 from triaxcald.signing.chain import OpenChain
 from triaxcald.signing.keys import SigningKey
+from triaxcald.station.config import Limits
+from triaxcald.work import Attempt, Work
 
 Keys = dict[str, SigningKey]
 Make = Callable[[Line, Keys], object]
@@ -448,27 +458,8 @@ def test_a_revoked_key_keeps_its_chain_but_not_its_trust(line: Line) -> None:
 
 def test_retention_signs_a_tombstone_for_each_segment_that_it_deletes(line: Line) -> None:
     """A segment for which none can be signed stays."""
-    from tests.daemon.signing.line import batch
-    from triaxcald.recording.manifest import Retention
-    from triaxcald.recording.segments import SegmentedWriter
-
-    def written(bury: Any) -> SegmentedWriter:
-        writer = SegmentedWriter(
-            line.folder / "log.segments.json", metadata={"bus": {}}, preview_channels=None, time_s=50.0,
-            retention=Retention(keep_s=100.0), bury=bury, clock_ns=lambda: line.now_ns, steady_ns=lambda: line.now_ns,
-        )  # fmt: skip
-        for i in range(5):
-            writer.raw("bus/0", batch(line.now_ns, i))
-            line.now_ns += 60 * SECOND_NS
-            writer.drain()
-        writer.close()
-        return writer
-
-    def cannot(*_: Any) -> None:
-        raise NotSigned("no key")
-
-    assert written(cannot).deleted == []
-    deleted = written(line.signing.bury).deleted
+    assert _written(line, _cannot, keep_s=100.0).deleted == []
+    deleted = _written(line, line.signing.bury, keep_s=100.0).deleted
     assert len(deleted) >= 3
     found = audit_chain(line.folder)
     assert (found.differences, found.tombstones) == ((), len(deleted))
@@ -478,10 +469,60 @@ def test_retention_signs_a_tombstone_for_each_segment_that_it_deletes(line: Line
     ]
 
 
-def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, tmp_path: Path) -> None:
-    from tests.conftest import Workshop
-    from triaxcald.cli.commands import main
+def _written(line: Line, bury: Any, batches: int = 5, **retention: Any) -> SegmentedWriter:
+    writer = SegmentedWriter(
+        line.folder / "log.segments.json", metadata={"bus": {}}, preview_channels=None, time_s=50.0,
+        retention=Retention(**retention), bury=bury, clock_ns=lambda: line.now_ns, steady_ns=lambda: line.now_ns,
+    )  # fmt: skip
+    for i in range(batches):
+        writer.raw("bus/0", batch(line.now_ns, i))
+        line.now_ns += 60 * SECOND_NS
+        writer.drain()
+    writer.close()
+    return writer
 
+
+def _cannot(*_: Any) -> None:
+    raise NotSigned("no key")
+
+
+def test_the_tombstone_of_a_segment_is_of_its_bytes_not_of_what_the_manifest_states(line: Line) -> None:
+    _written(line, _cannot, keep_s=100.0)
+    digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in line.folder.glob("log-*.mcap")}
+    manifest = line.folder / "log.segments.json"
+    document = json.loads(manifest.read_text())
+    for segment in document["segments"]:
+        segment["sha256"] = _digest(line, 2)  # of a signed recording
+    manifest.write_text(json.dumps(document))
+    buried: list[tuple[str, str]] = []
+    _written(line, lambda of, name, _: buried.append((name, of)), keep_s=100.0)
+    assert set(digests.items()) & set(buried)
+    assert _digest(line, 2) not in dict(buried).values()
+
+
+def test_a_recording_that_finds_no_room_says_that_nothing_can_be_signed(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _written(line, _cannot, keep_s=100.0)
+    monkeypatch.setattr(disk, "free_bytes", lambda _: disk.END_BYTES - 1)
+    with pytest.raises(DiskError, match="no deletion can be signed: no key"):
+        _written(line, _cannot, free_bytes=2**62)
+
+
+def test_a_segment_that_stays_is_buried_once(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink, buried = Path.unlink, list[str]()
+
+    def stays(path: Path, missing_ok: bool = False) -> None:
+        if path.suffix == ".mcap":
+            raise PermissionError(1, "not permitted")
+        unlink(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", stays)
+    _written(line, lambda _, name, __: buried.append(name), 12, keep_s=100.0)
+    assert len(buried) == len(set(buried)) >= 3
+
+
+def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, tmp_path: Path) -> None:
     station = Workshop(line.folder).station({"bus": {"host": "127.0.0.1", "port": 1}})
     delete = ["log", "delete", "--station", str(station), "--reason", "two years old"]
     assert main([*delete, str(line.made[2])]) == 2  # without a key
@@ -494,6 +535,80 @@ def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, 
     assert line.made[2].with_suffix(f".{ATTACHMENT}").exists()
     found = audit_chain(line.folder)
     assert (found.differences, found.tombstones) == ((), 1)
+
+
+@pytest.fixture
+def delete(line: Line, key: SigningKey) -> list[str]:
+    """The command, of a station that has its key."""
+    assert key.folder is not None
+    shutil.copy(key.folder / "line-1.key", line.folder / "keys")
+    station = Workshop(line.folder).station({"bus": {"host": "127.0.0.1", "port": 1}})
+    return ["log", "delete", "--json", "--station", str(station), "--reason", "age"]
+
+
+def _cut_short(line: Line) -> None:
+    data = line.made[2].read_bytes()
+    line.made[2].write_bytes(data[: len(data) // 2])
+
+
+def _empty(line: Line) -> None:
+    line.made[2].write_bytes(b"")
+
+
+def _under_way(line: Line) -> None:
+    attempts = Attempts(line.folder, "tray", "bench", Limits().model_dump())
+    with attempts.under_way():
+        attempts.begin(Attempt("run", when(line.now_ns), Work("unit", "1"), recording=line.made[2].name))
+
+
+@pytest.mark.parametrize("make", [_cut_short, _empty, _under_way])
+def test_a_recording_that_is_being_made_is_not_deleted(
+    line: Line, delete: list[str], make: Callable[[Line], None]
+) -> None:
+    make(line)
+    assert main([*delete, str(line.made[1]), str(line.made[2])]) == 2
+    assert all(path.exists() for path in line.made)
+    assert len(lines_of(line.folder)) == 5
+
+
+def test_a_recording_that_is_named_twice_gets_one_tombstone(
+    line: Line, delete: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(line.folder)
+    assert main([*delete, str(line.made[2]), line.made[2].name]) == 0
+    assert json.loads(capsys.readouterr().out)["deleted"] == [str(line.made[2])]
+    found = audit_chain(line.folder)
+    assert (found.differences, found.tombstones) == ((), 1)
+
+
+def test_what_was_deleted_is_told_where_the_next_one_fails(
+    line: Line, delete: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line.made[3].with_suffix(".report.html").mkdir()
+    assert main([*delete, *map(str, line.made[2:4])]) == 2
+    assert json.loads(capsys.readouterr().out)["deleted"] == [str(line.made[2])]
+    assert [path.exists() for path in line.made[2:4]] == [False, True]
+    assert kinds(line) == []
+
+
+@pytest.mark.parametrize("of", ["a copy with another name", "a recording with the envelope of another"])
+def test_a_tombstone_of_one_recording_does_not_bury_another(line: Line, delete: list[str], of: str) -> None:
+    other = line.folder / "other.mcap"
+    if of == "a copy with another name":
+        shutil.copy(line.made[2], other)
+    else:
+        line.record("other.mcap", signed=False)
+        put_signature(other, Forgery.of(line.made[2]).attachment(SIGNATURE_FILE).data)
+    assert main([*delete, str(other)]) == 0
+    assert kinds(line) == []
+    removed(line.made[2])
+    assert kinds(line) == [Kind.REMOVED]
+
+
+def test_a_tombstone_under_another_name_is_of_no_entry(line: Line) -> None:
+    line.signing.bury(_digest(line, 2), "other.mcap", "age")
+    removed(line.made[2])
+    assert kinds(line) == [Kind.REMOVED]
 
 
 def test_a_station_whose_chain_is_gone_does_not_begin_another(line: Line, key: SigningKey) -> None:
