@@ -117,8 +117,7 @@ def new_key(folder: Path, name: str, passphrase: bytes | None) -> SigningKey:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.path.lexists(path.with_suffix(PUBLIC)) or os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, "exists already; a key is never overwritten")
-        with new_file(path) as file:
-            os.chmod(path, stat.S_IRUSR | stat.S_IWUSR)  # before anything is in it
+        with new_file(path, stat.S_IRUSR | stat.S_IWUSR) as file:
             file.write(_pem_of(pair, passphrase))
             file.flush()
             os.fsync(file.fileno())

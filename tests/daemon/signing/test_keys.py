@@ -153,6 +153,50 @@ def test_a_key_is_made_trusted_and_revoked(folder: Path, capsys: pytest.CaptureF
     assert listed() == {"line-1": "revoked"}
 
 
+def test_keys_are_listed_by_what_they_are_not_by_their_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    ids = {name: new_key(folder / "keys", name, None).id for name in ("a", "b", "c")}
+    for name, file in (("b", "a"), ("other", "b")):  # the key in a.pub is trusted as b, that in b.pub as other
+        assert main(["keys", "trust", name, "--public", f"keys/{file}.pub"]) == 0
+    (folder / "keys" / "b.pub").unlink()
+    assert main(["keys", "revoke", "b", "--reason", "stolen"]) == 0
+    capsys.readouterr()
+    assert main(["keys", "list", "--json"]) == 0
+    rows = [(key["name"], key["key"], key["state"]) for key in json.loads(capsys.readouterr().out)["keys"]]
+    assert rows == [("a", ids["a"], "revoked"), ("c", ids["c"], "not trusted"), ("other", ids["b"], "trusted")]
+
+
+@pytest.mark.parametrize("command", [
+    ["keys", "revoke", "line-1"], ["log", "delete", "a.mcap", "--station", "station.toml"],
+])  # fmt: skip
+def test_a_reason_is_text(folder: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    new_key(folder / "keys", "line-1", None)
+    assert main(["keys", "trust", "line-1"]) == 0
+    capsys.readouterr()
+    assert main([*command, "--reason", "gestohlen, \udcfcbrigens"]) == 2  # Latin-1 on the command line
+    assert "--reason" in capsys.readouterr().err
+
+
+def test_a_private_key_is_at_no_moment_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[int] = []
+    of_os = os.open
+
+    def opened(path: str, flags: int, mode: int = 0o777, **rest: int) -> int:
+        found = of_os(path, flags, mode, **rest)
+        if str(path).endswith(".key"):
+            modes.append(_mode(Path(path)))
+        return found
+
+    before = os.umask(0)
+    try:
+        monkeypatch.setattr(os, "open", opened)
+        new_key(tmp_path, "a", None)
+    finally:
+        os.umask(before)
+    assert modes == [0o600]
+
+
 def test_a_new_key_takes_the_passphrase_of_the_environment_or_of_a_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
