@@ -138,8 +138,10 @@ class _ChainAudit:
     _keys: set[str] = field(default_factory=set)
 
     def run(self) -> ChainAudit:
-        signed, unsigned = self._recordings()
+        # A run may end meanwhile. What it adds to the chain after this is an entry too.
         path = self.folder / chain.NAME
+        entries = self._entries(path) if path.exists() else []
+        signed, unsigned = self._recordings()
         missing = forgotten(self.folder)
         for memory in missing:
             if Path(memory.of) != self.folder.resolve():
@@ -149,7 +151,7 @@ class _ChainAudit:
                 raise InputError(f"{self.folder}: no chain of signed recordings ({chain.NAME})")
             self._add(chain.NAME, Kind.NO_CHAIN)
             return ChainAudit(str(self.folder), tuple(self.differences))
-        entries = self._entries(path)
+        entries = entries or self._entries(path)
         self._keys = {one.envelope.key_id for one in signed}
         start, tombstones = self._said(entries)
         self._linked(entries, signed)
@@ -288,16 +290,22 @@ class _ChainAudit:
         there: dict[str, list[_Signed]] = {}
         for one in signed:
             there.setdefault(one.digest, []).append(one)
+        missing: list[Entry] = []
         for entry in entries:
             if entry.kind is not EntryKind.RECORDING:
                 continue
             found = sorted(there.get(entry.digest, []), key=lambda one: one.path.name != one.name)
             if not found and (entry.digest, entry.recording) not in tombstones:
-                self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
+                missing.append(entry)
             for other in found[1:]:
                 self._add(other.path.name, Kind.COPIED, again=str(found[0].path))
             if found and found[0].path.name != found[0].name:
                 self._add(found[0].path.name, Kind.RENAMED, stored=found[0].name)
+        if missing:  # they may have been deleted while this was read
+            tombstones |= self._said(self._entries(self.folder / chain.NAME))[1]
+        for entry in missing:
+            if (entry.digest, entry.recording) not in tombstones:
+                self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
 
     def _inserted(self, entries: Sequence[Entry], signed: Sequence[_Signed]) -> list[Entry]:
         """Signed recordings that no line has. One that continues the chain was closed
@@ -355,9 +363,13 @@ class _ChainAudit:
         here = self.folder.resolve()
         for folder in (here, *here.parents):
             for known in chain.memories(folder / FOLDER):
-                ours = known.of == str(here) or entries[0].digest[:16] in known.path.name
-                if ours and known.digest not in digests:
+                ours = known.of == str(here) or Memory.is_of(known.path, entries[0])
+                if ours and known.digest not in digests and known.digest not in self._digests_by_now():
                     self._add(chain.NAME, Kind.CUT, stored=last, again=f"entry {known.number}")
+
+    def _digests_by_now(self) -> set[str]:
+        """Those of the chain, which may have gone on since it was read."""
+        return {entry.digest for entry in self._entries(self.folder / chain.NAME)}
 
 
 def _claims_in(entry: Entry) -> Claims | None:

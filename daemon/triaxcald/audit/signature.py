@@ -181,7 +181,8 @@ def _is_older(path: td.files.AnyPath, found: Survey, trust: Trust) -> bool:
 
 
 def trusted_start(at: Path, trust: Trust) -> chain.Start | None:
-    """The start of a chain that a trusted key has signed; None of any other."""
+    """The start of a chain that is signed by a key as trusted as that of a recording
+    has to be; None of any other."""
     try:
         entry = chain.entry_of(chain.read_lines(at)[0])
         start = chain.said_in(entry)
@@ -190,9 +191,7 @@ def trusted_start(at: Path, trust: Trust) -> chain.Start | None:
     envelope = entry.envelope
     if not isinstance(start, chain.Start) or envelope is None:
         return None
-    known = trust.key(envelope.key_id)
-    good = known is not None and verifies(known.public_bytes, envelope.signature, envelope.signed_bytes)
-    return start if good else None
+    return start if judge(envelope, start.claims, trust).state is State.TRUSTED else None
 
 
 def latest(found: Survey) -> datetime | None:

@@ -42,6 +42,7 @@ from triaxcald.run.attempts import Attempts
 from triaxcald.signing import chain
 from triaxcald.signing.chain import OpenChain
 from triaxcald.signing.keys import SigningKey
+from triaxcald.signing.trust import load_trust
 from triaxcald.station.config import Limits
 from triaxcald.work import Attempt, Work
 
@@ -304,6 +305,51 @@ def test_a_start_that_lists_an_outcome_takes_only_that_one_for_earlier(recorded:
     first = chain.said_in(chain.entry_of(chain.read_lines(recorded.folder / chain.NAME)[0]))
     assert isinstance(first, chain.Start)
     assert first.earlier == {outcome_digest(recorded.made[0])}
+
+
+def test_the_start_lists_outcomes_that_are_in_recordings_alone(tmp_path: Path, key: SigningKey) -> None:
+    line = Line(tmp_path, key)
+    line.record("earlier.mcap", signed=False).with_suffix(f".{ATTACHMENT}").unlink()
+    line.record()
+    found = audit_chain(tmp_path)
+    assert (found.differences, found.earlier) == ((), 1)
+
+
+@pytest.mark.parametrize(("revoked", "older"), [({}, True), ({"revoked": when(0), "reason": "stolen"}, False)])
+def test_the_start_of_a_revoked_key_makes_nothing_older(line: Line, revoked: dict[str, str], older: bool) -> None:
+    path = line.folder / "trust.toml"
+    trusted(line.folder, load_trust(path).file.since, line.key, **revoked)
+    assert looked_at(line.made[0], Policy())[0].older is older
+
+
+@pytest.mark.parametrize("meanwhile", ["a run ends", "the first run ends", "a recording is deleted"])
+def test_what_happens_while_an_audit_reads_is_no_difference(
+    line: Line, monkeypatch: pytest.MonkeyPatch, meanwhile: str, tmp_path: Path
+) -> None:
+    if meanwhile == "the first run ends":
+        line = Line(tmp_path / "first", replace(line.key, folder=None))
+        line.folder.mkdir()
+    listed, once = Path.rglob, list[int]()
+
+    def happens() -> None:
+        if meanwhile == "a recording is deleted":
+            line.signing.bury(_digest(line, 2), "unit-0002.mcap", "age")
+            removed(line.made[2])
+        else:
+            for _ in range(2):
+                line.record()
+
+    def slow(path: Path, pattern: str) -> Any:
+        if pattern != "*.mcap" or once:
+            return listed(path, pattern)
+        once.append(1)
+        before = list(listed(path, pattern)) if meanwhile == "a run ends" else None
+        happens()
+        return listed(path, pattern) if before is None else before
+
+    monkeypatch.setattr(Path, "rglob", slow)
+    assert kinds(line) == []
+    assert once
 
 
 def test_a_folder_without_chain_and_signatures_is_an_error(tmp_path: Path, key: SigningKey) -> None:
@@ -624,9 +670,13 @@ def test_a_station_whose_chain_is_gone_does_not_begin_another(line: Line, key: S
     for memory in chain.memories(line.folder / "keys"):
         if memory.of == str(other.folder.resolve()):
             memory.path.unlink()
+    with pytest.raises(InputError):  # what was signed into it is still there
+        other.signing.require_works()
+    for path in other.folder.glob("unit-*.m*"):
+        path.unlink()
     other.signing.require_works()
     other.record("again.mcap")
-    assert [d.kind for d in audit_chain(other.folder).differences] == [Kind.INSERTED]
+    assert audit_chain(other.folder).differences == ()
 
 
 def test_each_chain_below_a_folder_is_its_own(line: Line, keys: Keys) -> None:
