@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from triaxcald.errors import DaemonError, DiskError, InputError, NotSigned
-from triaxcald.outcome import SUFFIX
+from triaxcald.outcome import ATTACHMENT, SUFFIX
 from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.manifest import SealedContents, SignatureMade
+from triaxcald.recording.reader import indexed_attachments
 from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.signing import chain, hsm, stamps
 from triaxcald.signing.chain import Entry, EntryKind, Memory, OpenChain
@@ -56,7 +57,7 @@ class StationSigning:
         when the context ends. Raises NotSigned, OSError."""
         with self._next() as (open_chain, claims):
             payload = manifest(contents, claims)
-            envelope = self._envelope(MANIFEST_TYPE, payload, stamped=True)
+            envelope = self._envelope(MANIFEST_TYPE, payload)
             name = str(contents.metadata.get("run", {}).get("run", ""))
             recording = chain.recording_in(contents) or name
             entry = Entry(EntryKind.RECORDING, claims.number, chain.digest_of(payload), recording)
@@ -85,7 +86,7 @@ class StationSigning:
                 open_chain.settle()
                 head = open_chain.head
                 assert head is not None
-                chain.require_remembered(self._remembered(open_chain), head)
+                self._require_remembered(open_chain)
                 yield open_chain, self._claims(head.number + 1, head.digest)
         except DiskError:
             raise
@@ -108,17 +109,30 @@ class StationSigning:
         """The folder as the key remembers it."""
         return str(self.folder.resolve())
 
-    def _remembered(self, open_chain: OpenChain) -> Memory | None:
-        """What the key remembers of a chain that has begun."""
-        folder = self.key.folder
-        return None if folder is None else Memory.read(Memory.path_of(folder, self.key.name, open_chain.start()))
+    def _require_remembered(self, open_chain: OpenChain) -> None:
+        """Raises NotSigned where this key or another of its folder remembers more of
+        the chain, or another chain here."""
+        start = open_chain.start()
+        for known in self._memories():
+            if Memory.is_of(known.path, start):
+                chain.require_remembered(known, open_chain.head)
+            elif known.of == self._of:
+                chain.require_remembered(known, None)
 
     def _require_new(self) -> None:
         """Raises NotSigned where the folder had a chain before."""
-        if self.key.folder is not None:
-            for known in chain.memories(self.key.folder, self.key.name):
-                if known.of == self._of:
-                    chain.require_remembered(known, None)
+        for known in self._memories():
+            if known.of == self._of:
+                chain.require_remembered(known, None)
+        signed = _signed_in(self.folder)
+        if signed is not None:
+            raise NotSigned(
+                f"{self.folder / chain.NAME} is gone, and {signed} was signed into it: put the chain back, or move "
+                "what is signed elsewhere"
+            )
+
+    def _memories(self) -> list[Memory]:
+        return [] if self.key.folder is None else chain.memories(self.key.folder)
 
     def _claims(self, number: int, previous: str) -> Claims:
         return Claims(self.key.name, to_text(self.key.public), iso_time(self.clock_ns()), number, previous)
@@ -127,9 +141,9 @@ class StationSigning:
         payload = canonical(document)
         return Entry(kind, claims.number, chain.digest_of(payload), recording, self._envelope(CHAIN_TYPE, payload))
 
-    def _envelope(self, payload_type: str, payload: bytes, *, stamped: bool = False) -> Envelope:
+    def _envelope(self, payload_type: str, payload: bytes) -> Envelope:
         signature = self.key.sign(pae(payload_type, payload))
-        stamp = stamps.stamp(self.authority, signature) if stamped and self.authority is not None else None
+        stamp = None if self.authority is None else stamps.stamp(self.authority, signature)
         return Envelope(payload_type, payload, self.key.id, signature, stamp)
 
     def require_works(self) -> None:
@@ -138,13 +152,15 @@ class StationSigning:
         try:
             if not verifies(self.key.public, self.key.sign(probe), probe):
                 raise InputError(f"key {self.key.name}: what it signs is not verified by its own public key")
-            if not (self.folder / chain.NAME).exists():
+            if not os.path.lexists(self.folder / chain.NAME):
                 self._require_new()
                 return
             with chain.locked(self.folder) as open_chain:
-                if open_chain.head is not None:
+                if open_chain.head is None:
+                    self._require_new()
+                else:
                     open_chain.settle()
-                    chain.require_remembered(self._remembered(open_chain), open_chain.head)
+                    self._require_remembered(open_chain)
         except OSError as e:
             raise InputError(f"{self.folder / chain.NAME}: cannot be written: {e.strerror}") from e
         except DaemonError as e:
@@ -152,12 +168,26 @@ class StationSigning:
 
 
 def earlier_outcomes(folder: Path) -> list[str]:
-    """Digests of all outcomes in a folder and below it."""
+    """Digests of all outcomes in a folder and below it, in recordings and beside
+    them."""
     found = set()
     for path in folder.rglob(f"*{SUFFIX}"):
         with suppress(OSError):
             found.add(outcome_digest(path.read_bytes()))
+    for path in folder.rglob("*.mcap"):
+        found |= {outcome_digest(data) for data in indexed_attachments(path, ATTACHMENT).values()}
     return sorted(found)
+
+
+def _signed_in(folder: Path) -> Path | None:
+    """A signed recording, or a signature, that is of no chain below the folder."""
+    others = {path.parent for path in folder.rglob(chain.NAME)} - {folder}
+    for pattern in (f"*.{SIGNATURE_FILE}", "*.mcap"):
+        for path in sorted(folder.rglob(pattern)):
+            signed = path.suffix != ".mcap" or indexed_attachments(path, SIGNATURE_FILE)
+            if signed and not others & set(path.parents):
+                return path
+    return None
 
 
 # Which key a station has.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import shutil
+import stat
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +24,7 @@ from triaxcald.audit import Policy, audit_chain
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State
 from triaxcald.cli.commands import main
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, NotSigned
 from triaxcald.run.attempts import Attempts, settle_killed
 from triaxcald.signing import chain
 from triaxcald.signing.keys import PASSPHRASE, SigningKey, new_key
@@ -115,6 +117,50 @@ def _garbled_chain(folder: Path) -> None:
     (folder / "chain.jsonl").write_text("what?\n")
 
 
+def _emptied_chain(folder: Path) -> None:
+    """The key remembers another."""
+    key = new_key(folder / "keys", "line-1", None)
+    Line(folder, key).record()
+    (folder / "chain.jsonl").write_text("")
+
+
+def _partial_chain(folder: Path) -> None:
+    """And nobody remembers it."""
+    _emptied_chain(folder)
+    (folder / "chain.jsonl").write_text('{"kind": "star')
+    for path in (folder / "keys").glob("*.head"):
+        path.unlink()
+
+
+def _linked_chain(folder: Path) -> None:
+    new_key(folder / "keys", "line-1", None)
+    (folder / "chain.jsonl").symlink_to(folder / "none")
+
+
+def _another_key_remembers(folder: Path) -> None:
+    Line(folder, new_key(folder / "keys", "line-1", None)).record()
+    for path in folder.glob("*.*"):
+        if path.suffix != ".toml":
+            path.unlink()
+    (folder / "keys" / "line-1.key").unlink()
+    new_key(folder / "keys", "line-2", None)
+
+
+def _another_chain(folder: Path) -> None:
+    """Which the key began elsewhere."""
+    key = new_key(folder / "keys", "line-1", None)
+    Line(folder, key).record()
+    (folder / "other").mkdir()
+    Line(folder / "other", key, T0_NS + SECOND_NS).record()
+    shutil.copy(folder / "other" / "chain.jsonl", folder / "chain.jsonl")
+
+
+def _signed_without_chain(folder: Path) -> None:
+    Line(folder, new_key(folder / "keys", "line-1", None)).record()
+    for path in (folder / "chain.jsonl", *folder.glob("*.dsse.json"), *(folder / "keys").glob("*.head")):
+        path.unlink()
+
+
 def _two(folder: Path) -> None:
     for name in ("line-1", "line-2"):
         new_key(folder / "keys", name, None)
@@ -166,6 +212,12 @@ CANNOT: list[tuple[str, Callable[[Path], object], dict[str, Any]]] = [
     ("key not in the trust file", _not_in_trust, {}),
     ("trust file unusable", _no_trust, {}),
     ("chain garbled", _garbled_chain, {}),
+    ("chain emptied", _emptied_chain, {}),
+    ("chain cut in its first line", _partial_chain, {}),
+    ("chain a link to nothing", _linked_chain, {}),
+    ("chain gone, and another key remembers it", _another_key_remembers, {}),
+    ("another chain", _another_chain, {}),
+    ("chain gone, and a recording was signed into it", _signed_without_chain, {}),
     ("device absent", lambda _: None, {"key": "line-1", "pkcs11": {"module": "/none.so", "token": "station"}}),
 ]
 
@@ -186,6 +238,24 @@ def test_a_run_that_cannot_sign_ends_before_it_asks_for_a_device(
         out, err = capsys.readouterr()
         assert (out, err.count("\n")) == ("", 1), err
     assert sorted(workshop.folder.iterdir()) == before
+
+
+def test_a_run_does_not_wait_for_ever_for_the_chain(
+    workshop: Workshop, station: Callable[..., Station], monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    line = Line(workshop.folder, new_key(workshop.folder / "keys", "line-1", None))
+    line.record()
+    path = workshop.folder / chain.NAME
+    assert stat.S_IMODE(path.stat().st_mode) & ~0o640 == 0
+    monkeypatch.setattr(chain, "LOCK_S", 0.2)
+    with open(path) as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["run", str(station().path)]) == 2
+        assert str(path) in capsys.readouterr().err
+        with pytest.raises(NotSigned):
+            line.record("late.mcap")
+    line.record("again.mcap")
 
 
 def test_a_run_that_can_sign_goes_on_to_the_device(
