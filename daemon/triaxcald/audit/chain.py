@@ -3,6 +3,7 @@ off, copied, or closed out of its time."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -110,7 +111,7 @@ def forgotten(folder: Path) -> list[Memory]:
     here = folder.resolve()
     keys = [*(path for path in folder.rglob(FOLDER)), *(path / FOLDER for path in (here, *here.parents))]
     known = {memory.path.resolve(): memory for at in keys for memory in chain.memories(at)}
-    missing = [m for m in known.values() if _is_below(m.of, here) and not (Path(m.of) / chain.NAME).exists()]
+    missing = [m for m in known.values() if _is_below(m.of, here) and not os.path.lexists(Path(m.of) / chain.NAME)]
     if not missing:
         return []
     starts = [_start_of(path) for path in folder.rglob(chain.NAME)]  # it may have been moved with its folder

@@ -191,9 +191,9 @@ def _files(folder: Path, suffix: str) -> list[Path]:
     try:
         with os.scandir(folder) as entries:
             return sorted(folder / entry.name for entry in entries if entry.name.endswith(suffix))
-    except FileNotFoundError:
-        return []
     except OSError as e:
+        if isinstance(e, FileNotFoundError) or (isinstance(e, NotADirectoryError) and not os.path.lexists(folder)):
+            return []
         raise InputError(f"{folder}: cannot be read: {e.strerror}") from e
 
 
