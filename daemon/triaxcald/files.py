@@ -177,9 +177,9 @@ def new_beside(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that was not there before. Nothing of it is left where the context
-    does not come to its end.
+def new_file(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """A file that was not there before, from its first moment with no more than this
+    mode. Nothing of it is left where the context does not come to its end.
 
     Raises FileExistsError and other OSError.
     """
@@ -192,7 +192,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
     with at_abort(remove):
         try:
-            with open(path, "xb") as f:
+            with open(path, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as f:
                 yield f
         except BaseException:
             remove()

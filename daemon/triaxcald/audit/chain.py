@@ -3,7 +3,9 @@ off, copied, or closed out of its time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +19,7 @@ from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE
 from triaxcald.signing import chain
-from triaxcald.signing.chain import Entry, EntryKind, Start, Tombstone
+from triaxcald.signing.chain import Entry, EntryKind, Memory, Start, Tombstone
 from triaxcald.signing.envelope import MANIFEST_TYPE, Envelope, NotAnEnvelope, parse_envelope, payload_of
 from triaxcald.signing.keys import FOLDER
 from triaxcald.signing.manifest import Claims, claims_of
@@ -68,6 +70,10 @@ class _Signed:
         return chain.digest_of(self.envelope.payload)
 
 
+Tombstones = set[tuple[str, str | None]]
+"""Digests, as `Tombstone` has them, each with the name of the recording."""
+
+
 def audit_chain(folder: Path, policy: Policy = Policy(), head: str | None = None) -> ChainAudit:  # noqa: B008 - frozen
     """``head`` is the digest of an entry that the chain is known to have had. Raises
     InputError for a folder without a chain or a signed recording, and for an unusable
@@ -76,10 +82,51 @@ def audit_chain(folder: Path, policy: Policy = Policy(), head: str | None = None
 
 
 def chains_in(folder: Path) -> list[Path]:
-    """The folder with its own chain, or those below it that have one; the folder itself
-    where there is none."""
-    below = sorted(path.parent for path in folder.rglob(chain.NAME))
-    return below or [folder]
+    """The folder and those below it that have a chain. The folder itself is among them
+    where there is none at all, and where a chain is missing: signed recordings are of
+    none, or a key remembers one that is gone."""
+    below = sorted({path.parent for path in folder.rglob(chain.NAME)})
+    if below and folder not in below and not _lacks_chain(folder, below):
+        return below
+    return [folder, *(path for path in below if path != folder)]
+
+
+def _lacks_chain(folder: Path, chains: Sequence[Path]) -> bool:
+    if forgotten(folder):
+        return True
+    if any(_outside(folder, f"*.{SIGNATURE_FILE}", chains)):
+        return True
+    return any(chain.is_signed(path) for path in _outside(folder, "*.mcap", chains))
+
+
+def _outside(folder: Path, pattern: str, chains: Iterable[Path]) -> Iterator[Path]:
+    """Files below the folder that are in none of these."""
+    others = set(chains)
+    return (path for path in sorted(folder.rglob(pattern)) if not others & set(path.parents))
+
+
+def forgotten(folder: Path) -> list[Memory]:
+    """What keys in the folder, below and above it remember of chains in it that are
+    not there."""
+    here = folder.resolve()
+    keys = [*(path for path in folder.rglob(FOLDER)), *(path / FOLDER for path in (here, *here.parents))]
+    known = {memory.path.resolve(): memory for at in keys for memory in chain.memories(at)}
+    missing = [m for m in known.values() if _is_below(m.of, here) and not os.path.lexists(Path(m.of) / chain.NAME)]
+    if not missing:
+        return []
+    starts = [_start_of(path) for path in folder.rglob(chain.NAME)]  # it may have been moved with its folder
+    return [m for m in missing if not any(start and start[:16] in m.path.name for start in starts)]
+
+
+def _is_below(of: str, folder: Path) -> bool:
+    return Path(of).is_absolute() and Path(of).is_relative_to(folder)
+
+
+def _start_of(path: Path) -> str | None:
+    """The digest of a chain's first entry; None without one."""
+    with suppress(InputError, NotAnEnvelope, IndexError):
+        return chain.entry_of(chain.read_lines(path)[0]).digest
+    return None
 
 
 @dataclass
@@ -92,14 +139,20 @@ class _ChainAudit:
     _keys: set[str] = field(default_factory=set)
 
     def run(self) -> ChainAudit:
-        signed, unsigned = self._recordings()
+        # A run may end meanwhile. What it adds to the chain after this is an entry too.
         path = self.folder / chain.NAME
+        entries = self._entries(path) if path.exists() else []
+        signed, unsigned = self._recordings()
+        missing = forgotten(self.folder)
+        for memory in missing:
+            if Path(memory.of) != self.folder.resolve():
+                self._add(str(Path(memory.of) / chain.NAME), Kind.NO_CHAIN)
         if not path.exists():
-            if not signed:
+            if not (signed or missing or self._below(f"*.{SIGNATURE_FILE}")):
                 raise InputError(f"{self.folder}: no chain of signed recordings ({chain.NAME})")
             self._add(chain.NAME, Kind.NO_CHAIN)
             return ChainAudit(str(self.folder), tuple(self.differences))
-        entries = self._entries(path)
+        entries = entries or self._entries(path)
         self._keys = {one.envelope.key_id for one in signed}
         start, tombstones = self._said(entries)
         self._linked(entries, signed)
@@ -154,7 +207,7 @@ class _ChainAudit:
     def _below(self, pattern: str) -> list[Path]:
         """Files in the folder, but for those of folders with a chain of their own."""
         others = {path.parent for path in self.folder.rglob(chain.NAME)} - {self.folder}
-        return [path for path in sorted(self.folder.rglob(pattern)) if not others & set(path.parents)]
+        return list(_outside(self.folder, pattern, others))
 
     def _entries(self, path: Path) -> list[Entry]:
         """The lines of the chain up to the first that is none."""
@@ -174,9 +227,9 @@ class _ChainAudit:
 
     # Signatures and links.
 
-    def _said(self, entries: Sequence[Entry]) -> tuple[Start | None, dict[str, Tombstone]]:
+    def _said(self, entries: Sequence[Entry]) -> tuple[Start | None, Tombstones]:
         """What start and tombstones say, if their signatures hold."""
-        start, tombstones, before = None, dict[str, Tombstone](), ""
+        start, tombstones, before = None, Tombstones(), ""
         for entry in entries:
             if entry.envelope is not None:
                 try:
@@ -190,7 +243,7 @@ class _ChainAudit:
                     elif good and isinstance(said, Start):
                         start = said
                     elif good and isinstance(said, Tombstone):
-                        tombstones[said.of] = said
+                        tombstones.add((said.of, said.recording))
             before = entry.digest
         return start, tombstones
 
@@ -234,20 +287,26 @@ class _ChainAudit:
 
     # Recordings that are missing, or too many.
 
-    def _removed(self, entries: Sequence[Entry], tombstones: dict[str, Tombstone], signed: Sequence[_Signed]) -> None:
+    def _removed(self, entries: Sequence[Entry], tombstones: Tombstones, signed: Sequence[_Signed]) -> None:
         there: dict[str, list[_Signed]] = {}
         for one in signed:
             there.setdefault(one.digest, []).append(one)
+        missing: list[Entry] = []
         for entry in entries:
             if entry.kind is not EntryKind.RECORDING:
                 continue
             found = sorted(there.get(entry.digest, []), key=lambda one: one.path.name != one.name)
-            if not found and entry.digest not in tombstones:
-                self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
+            if not found and (entry.digest, entry.recording) not in tombstones:
+                missing.append(entry)
             for other in found[1:]:
                 self._add(other.path.name, Kind.COPIED, again=str(found[0].path))
             if found and found[0].path.name != found[0].name:
                 self._add(found[0].path.name, Kind.RENAMED, stored=found[0].name)
+        if missing:  # they may have been deleted while this was read
+            tombstones |= self._said(self._entries(self.folder / chain.NAME))[1]
+        for entry in missing:
+            if (entry.digest, entry.recording) not in tombstones:
+                self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
 
     def _inserted(self, entries: Sequence[Entry], signed: Sequence[_Signed]) -> list[Entry]:
         """Signed recordings that no line has. One that continues the chain was closed
@@ -275,7 +334,7 @@ class _ChainAudit:
                 self._add(path.name, Kind.INSERTED, again="not signed, and not there when the chain began")
         return earlier
 
-    def _sidecars(self, tombstones: dict[str, Tombstone]) -> None:
+    def _sidecars(self, tombstones: Tombstones) -> None:
         """A signature beside no recording, which only a recording that was removed
         leaves."""
         for path in self._below(f"*.{SIGNATURE_FILE}"):
@@ -284,11 +343,12 @@ class _ChainAudit:
                 continue
             try:
                 envelope = parse_envelope(path.read_bytes())
-                number: int | str = claims_of(payload_of(envelope, MANIFEST_TYPE)).number
+                said = payload_of(envelope, MANIFEST_TYPE)
+                number: int | str = claims_of(said).number
             except (OSError, NotAnEnvelope):
                 self._add(recording.name, Kind.REMOVED, again="unknown")
                 continue
-            if chain.digest_of(envelope.payload) not in tombstones:
+            if (chain.digest_of(envelope.payload), said.get("recording")) not in tombstones:
                 self._add(recording.name, Kind.REMOVED, again=number)
 
     # The end.
@@ -301,11 +361,16 @@ class _ChainAudit:
         if not entries:
             self._add(chain.NAME, Kind.CUT, stored=None, again="a first entry")
             return
-        for folder in (self.folder / FOLDER, self.folder.parent / FOLDER):
-            for known in chain.memories(folder):
-                ours = known.of == str(self.folder.resolve()) or entries[0].digest[:16] in known.path.name
-                if ours and known.digest not in digests:
+        here = self.folder.resolve()
+        for folder in (here, *here.parents):
+            for known in chain.memories(folder / FOLDER):
+                ours = known.of == str(here) or Memory.is_of(known.path, entries[0])
+                if ours and known.digest not in digests and known.digest not in self._digests_by_now():
                     self._add(chain.NAME, Kind.CUT, stored=last, again=f"entry {known.number}")
+
+    def _digests_by_now(self) -> set[str]:
+        """Those of the chain, which may have gone on since it was read."""
+        return {entry.digest for entry in self._entries(self.folder / chain.NAME)}
 
 
 def _claims_in(entry: Entry) -> Claims | None:

@@ -174,7 +174,7 @@ class _Audit:
                 f"{self._path}: attachment {ATTACHMENT}: missing; the recording holds no result to audit"
             )
         signature, unproven = check_signature(self._path, self._held, found, self._policy)
-        self._signed = signature.state is State.TRUSTED
+        self._signed = signature.state is State.TRUSTED and not signature.mended
         again = self._again()
         self._check_outcome(found, again)
         if again is not None:

@@ -95,6 +95,8 @@ class Kind(Enum):
     REVOKED = auto()
     CLOCK = auto()
     """A time before one that it cannot be before."""
+    MENDED = auto()
+    """A later start signed it, with a verdict that it cannot vouch for."""
 
     # Of the chain of a folder.
     REMOVED = auto()

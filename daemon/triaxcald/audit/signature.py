@@ -17,10 +17,10 @@ import triaxcal_drivers as td
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.documents import json_value
 from triaxcald.errors import InputError
-from triaxcald.outcome import RUN_RECORD
+from triaxcald.outcome import RUN_RECORD, Verdict
 from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.manifest import End
-from triaxcald.recording.schema import SIGNATURE_FILE, STATION_FILE
+from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE, STATION_FILE
 from triaxcald.recording.survey import Survey
 from triaxcald.signing import chain, stamps
 from triaxcald.signing.envelope import MANIFEST_TYPE, MEDIA_TYPE, Envelope, NotAnEnvelope, parse_envelope, payload_of
@@ -28,7 +28,7 @@ from triaxcald.signing.keys import key_id, verifies
 from triaxcald.signing.manifest import Claims, claims_of, manifest
 from triaxcald.signing.stamps import Stamp, StampState
 from triaxcald.signing.trust import NAME as TRUST_FILE
-from triaxcald.signing.trust import Trust, load_trust, moment, nearest
+from triaxcald.signing.trust import Rejected, Trust, load_trust, moment, nearest
 
 CLOCK: Final = timedelta(seconds=1)
 """A clock that is corrected by steps may go back by some tenths of a second."""
@@ -49,22 +49,30 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Policy:
-    """What an audit asks of signatures. ``trust`` is the trust file, by default the
-    nearest one above a recording; ``allow_unsigned`` lets recordings pass that are not
-    signed, or not by a trusted key."""
+    """What an audit asks of signatures. ``trust`` is the trust file, by default that
+    of the folder among ``folders`` with the recording, else the nearest one above it;
+    ``allow_unsigned`` lets recordings pass that are not signed, or not by a trusted
+    key. ``folders`` are those that were asked for: a trust file further below, where
+    an audit was not asked to look for one, does not count."""
 
     trust: Path | None = None
     allow_unsigned: bool = False
+    folders: tuple[Path, ...] = ()
 
     def trust_of(self, recording: td.files.AnyPath) -> Trust | None:
-        """In a store only the file that was given counts. Raises InputError."""
+        """In a store only the file that was given counts. Raises InputError; Rejected
+        where the nearest one may be a stranger's."""
         path = self.file_of(recording)
         return None if path is None else load_trust(path)
 
     def file_of(self, recording: td.files.AnyPath) -> Path | None:
         if self.trust is not None or not isinstance(recording, Path):
             return self.trust
-        return nearest(recording.parent, TRUST_FILE)
+        parent = recording.parent.resolve()
+        for folder in self.folders:
+            if parent.is_relative_to(folder.resolve()) and (found := nearest(folder, TRUST_FILE)) is not None:
+                return found
+        return nearest(parent, TRUST_FILE)
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,8 @@ class Signature:
     it gives itself; ``signed`` the station's own time. ``number``, ``digest`` and
     ``previous`` are the place in the chain. ``stamp`` is None where no time stamp was
     asked for. ``older``: not signed, and from before the trust file. ``trust`` is the
-    path of that file, None without one."""
+    path of that file, None without one. ``mended``: a later start signed what an
+    earlier run had left, and knows no more of it than what is in the file."""
 
     state: State
     key: str | None = None
@@ -85,6 +94,7 @@ class Signature:
     stamp: Stamp | None = None
     older: bool = False
     trust: str | None = None
+    mended: bool = False
 
     def document(self) -> dict[str, Any]:
         stamp = self.stamp
@@ -105,6 +115,7 @@ class Signature:
             },
             "older": self.older,
             "trust": self.trust,
+            "mended": self.mended,
         }
 
 
@@ -159,7 +170,10 @@ def _is_older(path: td.files.AnyPath, found: Survey, trust: Trust) -> bool:
     last = latest(found)
     if last is None or last >= trust.since or not isinstance(path, Path):
         return False
-    at = nearest(path.parent, chain.NAME)
+    try:
+        at = nearest(path.parent, chain.NAME)
+    except Rejected:
+        return False
     if at is None:
         return True
     start = trusted_start(at, trust)
@@ -167,7 +181,8 @@ def _is_older(path: td.files.AnyPath, found: Survey, trust: Trust) -> bool:
 
 
 def trusted_start(at: Path, trust: Trust) -> chain.Start | None:
-    """The start of a chain that a trusted key has signed; None of any other."""
+    """The start of a chain that is signed by a key as trusted as that of a recording
+    has to be; None of any other."""
     try:
         entry = chain.entry_of(chain.read_lines(at)[0])
         start = chain.said_in(entry)
@@ -176,9 +191,7 @@ def trusted_start(at: Path, trust: Trust) -> chain.Start | None:
     envelope = entry.envelope
     if not isinstance(start, chain.Start) or envelope is None:
         return None
-    known = trust.key(envelope.key_id)
-    good = known is not None and verifies(known.public_bytes, envelope.signature, envelope.signed_bytes)
-    return start if good else None
+    return start if judge(envelope, start.claims, trust).state is State.TRUSTED else None
 
 
 def latest(found: Survey) -> datetime | None:
@@ -229,7 +242,13 @@ def _signed(data: bytes, found: Survey, trust: Trust | None, policy: Policy) -> 
     ended = moment(said.get("ended"))
     if (signed := moment(claims.signed)) is None or (ended is not None and signed < ended - CLOCK):
         differences.append(_of(Kind.CLOCK, "signed", stored=claims.signed, again=said.get("ended")))
-    return replace(judged.signature, state=state), differences
+    # Anybody can leave a recording without its end for the next start to mend and sign.
+    # A run that was killed has aborted; any other verdict may be somebody else's.
+    mended, verdict = RECOVERY_RECORD in found.closing, said.get("verdict")
+    vouched = mended and state is State.TRUSTED and verdict != Verdict.ABORTED.value
+    if vouched and not policy.allow_unsigned:
+        differences.append(_of(Kind.MENDED, "verdict", stored=verdict, again=Verdict.ABORTED.value))
+    return replace(judged.signature, state=state, mended=mended), differences
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,8 @@ def _what(of: Difference) -> str:
             return f"signed by key {_bare(of.again)}, which is revoked"
         case Kind.CLOCK:
             return f"{place}: {_bare(of.stored)} cannot be, by {_bare(of.again)}: a clock was set back"
+        case Kind.MENDED:
+            return f"{place}: {stored}, signed by the start that mended the recording, which only vouches for {again}"
         case Kind.REMOVED:
             return f"entry {of.again} of the chain is of no recording in the folder, and no tombstone says why"
         case Kind.INSERTED:
@@ -158,6 +160,7 @@ def signature(of: Signature) -> str | None:
     told = f"signed by {of.name or of.key} on {of.signed}, entry {of.number}; {_TRUST[of.state]}"
     if of.state is State.UNTRUSTED:
         told += " (no trust file)" if of.trust is None else f" ({of.trust})"
+    told += "; signed by the start that mended it" if of.mended else ""
     return f"{told}{_stamped(of.stamp)}"
 
 

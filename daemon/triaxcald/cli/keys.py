@@ -57,9 +57,11 @@ def list_command(a: argparse.Namespace) -> int:
     folder, keys = _folders(a)
     path = folder / trust.NAME
     file = trust.load_trust(path).file if path.exists() else None
-    known = {} if file is None else {key.name: key for key in file.keys}
-    here = {path.stem: read_public(path) for path in public_keys(keys)}
-    entries = [_entry(name, here.get(name), known.get(name)) for name in dict.fromkeys([*here, *known])]
+    known = {} if file is None else {key.id: key for key in file.keys}
+    read = [(path.stem, read_public(path)) for path in public_keys(keys)]
+    here = {key_id(public): (name, public) for name, public in reversed(read)}
+    entries = [_entry(name, public, known.get(of)) for of, (name, public) in reversed(here.items())]
+    entries += [_entry(key.name, None, key) for of, key in known.items() if of not in here]
     if a.json:
         since = None if file is None else file.since
         emit({"format": "triaxcal.keys/1", "trusted_since": since, "keys": entries,
@@ -73,21 +75,19 @@ def list_command(a: argparse.Namespace) -> int:
 
 
 def _entry(name: str, public: bytes | None, known: trust.TrustedKey | None) -> dict[str, Any]:
-    """A key in the folder, in the trust file, or in both."""
-    both = public is not None and known is not None and known.public_bytes == public
+    """A key in the folder, in the trust file, or in both, whatever its names there."""
     state = "not trusted"
-    if known is not None and (both or public is None):
+    if known is not None:
         state = "trusted" if known.revoked is None else "retired" if known.retired else "revoked"
     shown = public if public is not None else known.public_bytes if known is not None else b""
-    of = known if state != "not trusted" else None
     return {
         "name": name,
         "key": key_id(shown),
         "public": to_text(shown),
         "state": state,
-        "since": None if of is None else of.since,
-        "revoked": None if of is None else of.revoked,
-        "reason": None if of is None else of.reason,
+        "since": None if known is None else known.since,
+        "revoked": None if known is None else known.revoked,
+        "reason": None if known is None else known.reason,
     }
 
 

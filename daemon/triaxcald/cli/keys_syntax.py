@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from triaxcald.cli.syntax import add_command, add_json
+from triaxcald.cli.syntax import add_command, add_json, words
 
 
 def register_keys(commands: Any) -> None:
@@ -41,7 +41,7 @@ def register_keys(commands: Any) -> None:
         "keys revoke line-1 --reason 'the computer was stolen'",
     )  # fmt: skip
     p.add_argument("name", metavar="NAME")
-    p.add_argument("--reason", metavar="TEXT", required=True)
+    p.add_argument("--reason", metavar="TEXT", type=words, required=True)
     p.add_argument(
         "--retired", action="store_true",
         help="nobody else had it: what it says to have signed before stays trusted; without this, only what a time "

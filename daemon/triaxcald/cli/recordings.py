@@ -78,15 +78,23 @@ def _opened(path: Path) -> AbstractContextManager[BinaryIO]:
 
 
 def delete_command(a: argparse.Namespace) -> int:
+    from triaxcald.run.attempts import recordings_under_way
     from triaxcald.signing.deletion import delete
     from triaxcald.station.config import load_station
 
-    deleted = delete(load_station(a.station), a.recordings, a.reason)
+    station = load_station(a.station)
+    deleted: list[str] = []
+    try:
+        for path in delete(station, a.recordings, a.reason, recordings_under_way(station.folder)):
+            deleted.append(str(path))
+            if not a.json:
+                show(f"{path}: deleted")
+    except BaseException:
+        if a.json and deleted:  # and the next one could not be
+            emit({"format": "triaxcal.deletion/1", "deleted": deleted})
+        raise
     if a.json:
-        emit({"format": "triaxcal.deletion/1", "deleted": [str(path) for path in deleted]})
-    else:
-        for path in deleted:
-            show(f"{path}: deleted")
+        emit({"format": "triaxcal.deletion/1", "deleted": deleted})
     return 0
 
 

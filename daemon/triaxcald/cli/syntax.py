@@ -249,6 +249,16 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def words(text: str) -> str:
+    """A text that goes into a document, as the type of an argument. Raises
+    ArgumentTypeError."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # bytes of the command line that are no UTF-8
+        raise argparse.ArgumentTypeError("expected text in UTF-8") from None
+    return text
+
+
 def writable(path: Path | None) -> None:
     """Fail before the work, not after it, where a result could not be written.
     Raises InputError."""
@@ -839,7 +849,7 @@ def _logs(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("recordings", metavar="REC", nargs="+", type=Path)
     p.add_argument("--station", metavar="STATION.toml", type=Path, required=True, help="whose key signs it")
-    p.add_argument("--reason", metavar="TEXT", required=True)
+    p.add_argument("--reason", metavar="TEXT", type=words, required=True)
     add_json(p)
     p = add_command(
         parts, "export", "recordings:export_command", "write the samples as CSV", "", "log export rec.mcap -o rec.csv"

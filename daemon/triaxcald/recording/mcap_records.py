@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
 import zstandard
@@ -225,6 +225,12 @@ class Summary(NamedTuple):
     channels: dict[int, str]
     chunks: list[ChunkIndex]
     metadata: dict[str, int]  # by name, the offset of the record
+    attachments: dict[str, int]  # likewise
+
+
+_SUMMARIZED: Final = frozenset((
+    Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX,
+))  # fmt: skip
 
 
 def summary_of(stream: BinaryIO, name: str, size: int) -> Summary | None:
@@ -248,7 +254,7 @@ def summary_of(stream: BinaryIO, name: str, size: int) -> Summary | None:
     while offset < footer_at:
         unparsed = unparsed_at(stream, name, offset, size)
         crc = zlib.crc32(unparsed.body, zlib.crc32(unparsed.head, crc))
-        if unparsed.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
+        if unparsed.opcode in _SUMMARIZED:
             records.append(parse(unparsed, name))
         offset = unparsed.end
     statistics = [r for r in records if isinstance(r, Statistics)]
@@ -259,6 +265,7 @@ def summary_of(stream: BinaryIO, name: str, size: int) -> Summary | None:
         {r.id: r.topic for r in records if isinstance(r, Channel)},
         [r for r in records if isinstance(r, ChunkIndex)],
         {r.name: r.offset for r in records if isinstance(r, MetadataIndex)},
+        {r.name: r.offset for r in records if isinstance(r, AttachmentIndex)},
     )
 
 

@@ -627,6 +627,21 @@ def digest_of(path: td.files.AnyPath) -> str:
         raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
 
 
+def indexed_attachments(path: Path, *names: str) -> dict[str, bytes]:
+    """Attachments of a finished file, found by its index: nothing else of it is read or
+    checked. None of any other file. Raises nothing."""
+    found: dict[str, bytes] = {}
+    with suppress(OSError, RecordingError), td.files.open_file(path) as stream:
+        size = size_of(stream)
+        summary = summary_of(stream, str(path), size) if size > 2 * len(MAGIC) else None
+        for name in names:
+            if summary is not None and name in summary.attachments:
+                record = parse(unparsed_at(stream, str(path), summary.attachments[name], size), str(path))
+                if isinstance(record, Attachment) and record.name == name:
+                    found[name] = record.data
+    return found
+
+
 def open_recording(path: td.files.AnyPath, *, unfinished: bool = False, alike: bool = True) -> Recording | Series:
     """One file, or all that a manifest names, as `Recording` and `Series` have
     them. Raises RecordingError."""

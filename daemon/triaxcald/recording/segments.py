@@ -9,7 +9,6 @@ import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -308,6 +307,9 @@ class SegmentedWriter(RecordingWriter):
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._low_reported = False
         self._unread: str | None = None
+        self._unsigned: str | None = None
+        """Why the deletion of a segment could not be signed, if one could not."""
+        self._in_chain: set[Path] = set()  # segments with a tombstone, which may still be there
         """Document that cannot be read; it keeps segments that would be deleted."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
@@ -357,8 +359,11 @@ class SegmentedWriter(RecordingWriter):
         if free is None or free >= disk.END_BYTES:
             return []
         if free + sum(one.segment.bytes for one in chosen) < disk.END_BYTES:
-            raise self._with_document(disk.no_room(self.manifest, free))
-        return self._delete(chosen)
+            raise self._with_reason(disk.no_room(self.manifest, free))
+        gone = self._delete(chosen)
+        if not gone and self._unsigned:
+            raise self._with_reason(disk.no_room(self.manifest, free))
+        return gone
 
     # The following runs on the writer's thread, except for the first segment.
 
@@ -409,8 +414,9 @@ class SegmentedWriter(RecordingWriter):
         if not self._low_reported and self._lacks_room() and not self._retain():
             self._low_reported = True
             wanted = self._retention.free_bytes if self._retention else 0
-            unread = {} if self._unread is None else {"unread": self._unread}
-            self._file.write(schema.EVENTS, self._event("disk_low", {"wanted_bytes": wanted, **unread}))
+            why = {"unread": self._unread, "unsigned": self._unsigned}
+            why = {name: told for name, told in why.items() if told is not None}
+            self._file.write(schema.EVENTS, self._event("disk_low", {"wanted_bytes": wanted, **why}))
 
     def _finish(self) -> None:
         super()._finish()
@@ -436,11 +442,18 @@ class SegmentedWriter(RecordingWriter):
         try:
             super()._end_for_lack_of_room(free)
         except DiskError as e:
-            raise self._with_document(e) from None
+            raise self._with_reason(e) from None
 
-    def _with_document(self, e: DiskError) -> DiskError:
-        """Adds the document that prevented a deletion, if any."""
-        return DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") if self._unread else e
+    def _with_reason(self, e: DiskError) -> DiskError:
+        """Adds what prevented a deletion, if anything: a document, or that nothing can
+        be signed."""
+        if self._unread:
+            return DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read")
+        return (
+            DiskError(f"{e}; nothing was deleted, as no deletion can be signed: {self._unsigned}")
+            if self._unsigned
+            else e
+        )
 
     def _lacks_room(self) -> bool:
         """Whether less of the disk is free than the retention demands."""
@@ -488,11 +501,18 @@ class SegmentedWriter(RecordingWriter):
 
     def _buried(self, chosen: list[Surplus], bury: Bury) -> Iterator[Surplus]:
         """Segments whose deletion is signed. One for which nothing is signed stays."""
+        self._unsigned = None
         for one in chosen:
-            with suppress(RecordingError, OSError):
-                path = self._segments.path_of(one.segment)
-                bury(one.segment.sha256 or digest_of(path), path.name, one.reason)
-                yield one
+            path = self._segments.path_of(one.segment)
+            if os.path.lexists(path) and path not in self._in_chain:
+                try:
+                    # Not the digest that the manifest states, which is not signed.
+                    bury(digest_of(path), path.name, one.reason)
+                except (RecordingError, OSError) as e:
+                    self._unsigned = str(e)
+                    continue
+                self._in_chain.add(path)
+            yield one
 
     def _deleted(self, gone: list[Surplus]) -> schema.Event:
         return self._event("deleted", {"segments": [_detail_of(one) for one in gone]})

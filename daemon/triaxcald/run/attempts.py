@@ -221,6 +221,13 @@ class Killed:
     line: str
 
 
+def recordings_under_way(folder: Path) -> frozenset[str]:
+    """Names of the recordings of attempts that have no outcome yet: they are under
+    way, or were killed."""
+    files = map(AttemptFile.read, (folder / FOLDER).glob("*.json"))
+    return frozenset(file.attempt.recording for file in files if file is not None and file.attempt.recording)
+
+
 def settle_killed(station: Station) -> list[Killed]:
     """Write the outcomes of all killed attempts in the station's folder, and seal the
     recordings that a failing disk has left without an end. Raises InputError,

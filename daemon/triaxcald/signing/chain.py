@@ -17,6 +17,7 @@ import hashlib
 import json
 import os
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from typing import Any, Final
 from triaxcald.documents import json_value
 from triaxcald.errors import DiskError, InputError, NotSigned, RecordingError
 from triaxcald.files import is_of_the_disk, synchronise, write_durably
+from triaxcald.recording.manifest import SealedContents
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.signing.envelope import CHAIN_TYPE, Envelope, NotAnEnvelope, envelope_of, parse_envelope, payload_of
@@ -248,6 +250,20 @@ def _claims_of(path: Path, digest: str) -> Claims | None:
     return None
 
 
+def recording_in(contents: SealedContents) -> str | None:
+    """The name of the file, by its outcome."""
+    with suppress(ValueError, LookupError, TypeError, RecursionError):
+        return str(json_value(contents.document)["recording"])
+    return None
+
+
+def is_signed(path: Path) -> bool:
+    """Whether a finished recording has an attachment in the place of a signature."""
+    with suppress(RecordingError, InputError), Recording.open(path) as recording:
+        return SIGNATURE_FILE in recording.attachments
+    return False
+
+
 def envelope_in(path: Path) -> Envelope | None:
     """That of a finished recording; None without one that can be read."""
     try:
@@ -257,17 +273,27 @@ def envelope_in(path: Path) -> Envelope | None:
         return None
 
 
+LOCK_S: Final = 60.0
+"""Time for which a recording waits for others that are being closed. One takes its last
+bytes to the disk and waits 5 s for an authority that does not answer, which the next
+ones do not ask; a tray of 64 units is closed within this time."""
+_LOOK_S: Final = 0.05
+MODE: Final = 0o640
+"""Whoever can open the file can hold its lock, and so keep a station from signing."""
 _in_process: dict[Path, threading.Lock] = {}
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[OpenChain]:
     """The folder's chain, which no other thread or process extends meanwhile. Raises
-    NotSigned, InputError."""
-    path = folder / NAME
-    with _in_process.setdefault(path.resolve(), threading.Lock()):
+    NotSigned, InputError: also where somebody else holds it for more than `LOCK_S`."""
+    path, deadline = folder / NAME, time.monotonic() + LOCK_S
+    lock = _in_process.setdefault(path.resolve(), threading.Lock())
+    if not lock.acquire(timeout=LOCK_S):
+        raise InputError(f"{path}: this process has closed another recording for more than {LOCK_S:g} s")
+    try:
         try:
-            descriptor = _opened(path)
+            descriptor = _opened(path, deadline)
         except OSError as e:
             kind = DiskError if is_of_the_disk(e) else InputError
             raise kind(f"{path}: cannot be written: {e.strerror}") from e
@@ -275,21 +301,39 @@ def locked(folder: Path) -> Iterator[OpenChain]:
             yield OpenChain(path, descriptor)
         finally:
             os.close(descriptor)
+    finally:
+        lock.release()
 
 
-def _opened(path: Path) -> int:
+def _opened(path: Path, deadline: float) -> int:
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
     flags |= getattr(os, "O_BINARY", 0)
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, flags, 0o644)
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        descriptor = os.open(path, flags, MODE)
+        try:
+            _lock(path, descriptor, deadline)
+        except BaseException:
+            os.close(descriptor)
+            raise
         with suppress(OSError):
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 synchronise(path.parent)
                 return descriptor
         os.close(descriptor)  # it was replaced meanwhile
+
+
+def _lock(path: Path, descriptor: int, deadline: float) -> None:
+    while fcntl is not None:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                raise InputError(
+                    f"{path}: another process has held its lock for more than {LOCK_S:g} s; `fuser {path}` names it"
+                ) from None
+        time.sleep(_LOOK_S)
 
 
 # What the key itself remembers of a chain, in the folder of the key: a chain that was
@@ -311,6 +355,11 @@ class Memory:
         return folder / f"{key}-{start.digest[:16]}{MEMORY}"
 
     @staticmethod
+    def is_of(path: Path, start: Entry) -> bool:
+        """Whether the file of a memory is of the chain with this start."""
+        return path.name.endswith(f"-{start.digest[:16]}{MEMORY}")
+
+    @staticmethod
     def read(path: Path) -> Memory | None:
         """None of what is none."""
         try:
@@ -326,9 +375,9 @@ class Memory:
             write_durably(self.path, json.dumps(document) + "\n")
 
 
-def memories(folder: Path, key: str = "*") -> list[Memory]:
+def memories(folder: Path) -> list[Memory]:
     """All that the keys in a folder remember."""
-    return [found for path in sorted(folder.glob(f"{key}-*{MEMORY}")) if (found := Memory.read(path)) is not None]
+    return [found for path in sorted(folder.glob(f"*{MEMORY}")) if (found := Memory.read(path)) is not None]
 
 
 def require_remembered(known: Memory | None, head: Entry | None) -> None:

@@ -117,8 +117,7 @@ def new_key(folder: Path, name: str, passphrase: bytes | None) -> SigningKey:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.path.lexists(path.with_suffix(PUBLIC)) or os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, "exists already; a key is never overwritten")
-        with new_file(path) as file:
-            os.chmod(path, stat.S_IRUSR | stat.S_IWUSR)  # before anything is in it
+        with new_file(path, stat.S_IRUSR | stat.S_IWUSR) as file:
             file.write(_pem_of(pair, passphrase))
             file.flush()
             os.fsync(file.fileno())
@@ -178,12 +177,24 @@ def read_private(path: Path, passphrase: bytes | None) -> SigningKey:
 
 
 def private_keys(folder: Path) -> list[Path]:
-    """Files with private keys, by name."""
-    return sorted(folder.glob(f"*{PRIVATE}"))
+    """Files with private keys, by name; none where there is no folder. Raises
+    InputError: a folder that cannot be read is not one without keys."""
+    return _files(folder, PRIVATE)
 
 
 def public_keys(folder: Path) -> list[Path]:
-    return sorted(folder.glob(f"*{PUBLIC}"))
+    """As `private_keys`."""
+    return _files(folder, PUBLIC)
+
+
+def _files(folder: Path, suffix: str) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(folder / entry.name for entry in entries if entry.name.endswith(suffix))
+    except OSError as e:
+        if isinstance(e, FileNotFoundError) or (isinstance(e, NotADirectoryError) and not os.path.lexists(folder)):
+            return []
+        raise InputError(f"{folder}: cannot be read: {e.strerror}") from e
 
 
 def passphrase_of(file: Path | None, environment: Mapping[str, str] = os.environ) -> bytes | None:

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from triaxcald.documents import json_value
 from triaxcald.errors import DaemonError, DiskError, InputError, NotSigned
-from triaxcald.outcome import SUFFIX
+from triaxcald.outcome import ATTACHMENT, SUFFIX
 from triaxcald.outcome import digest_of as outcome_digest
 from triaxcald.recording.manifest import SealedContents, SignatureMade
+from triaxcald.recording.reader import indexed_attachments
 from triaxcald.recording.schema import SIGNATURE_FILE
 from triaxcald.signing import chain, hsm, stamps
 from triaxcald.signing.chain import Entry, EntryKind, Memory, OpenChain
@@ -27,13 +27,15 @@ from triaxcald.signing.keys import (
     key_id,
     passphrase_of,
     private_keys,
+    public_keys,
     read_private,
     read_public,
     to_text,
     verifies,
 )
 from triaxcald.signing.manifest import Claims, claims_document, manifest
-from triaxcald.signing.trust import Trust, trust_of
+from triaxcald.signing.trust import NAME as TRUST_FILE
+from triaxcald.signing.trust import Trust, load_trust, trust_of
 from triaxcald.station.config import Sign, Station
 from triaxcald.utc import iso_time
 
@@ -55,9 +57,9 @@ class StationSigning:
         when the context ends. Raises NotSigned, OSError."""
         with self._next() as (open_chain, claims):
             payload = manifest(contents, claims)
-            envelope = self._envelope(MANIFEST_TYPE, payload, stamped=True)
+            envelope = self._envelope(MANIFEST_TYPE, payload)
             name = str(contents.metadata.get("run", {}).get("run", ""))
-            recording = _recording_in(contents) or name
+            recording = chain.recording_in(contents) or name
             entry = Entry(EntryKind.RECORDING, claims.number, chain.digest_of(payload), recording)
             open_chain.note(recording, entry.digest)
             try:
@@ -84,7 +86,7 @@ class StationSigning:
                 open_chain.settle()
                 head = open_chain.head
                 assert head is not None
-                chain.require_remembered(self._remembered(open_chain), head)
+                self._require_remembered(open_chain)
                 yield open_chain, self._claims(head.number + 1, head.digest)
         except DiskError:
             raise
@@ -107,17 +109,30 @@ class StationSigning:
         """The folder as the key remembers it."""
         return str(self.folder.resolve())
 
-    def _remembered(self, open_chain: OpenChain) -> Memory | None:
-        """What the key remembers of a chain that has begun."""
-        folder = self.key.folder
-        return None if folder is None else Memory.read(Memory.path_of(folder, self.key.name, open_chain.start()))
+    def _require_remembered(self, open_chain: OpenChain) -> None:
+        """Raises NotSigned where this key or another of its folder remembers more of
+        the chain, or another chain here."""
+        start = open_chain.start()
+        for known in self._memories():
+            if Memory.is_of(known.path, start):
+                chain.require_remembered(known, open_chain.head)
+            elif known.of == self._of:
+                chain.require_remembered(known, None)
 
     def _require_new(self) -> None:
         """Raises NotSigned where the folder had a chain before."""
-        if self.key.folder is not None:
-            for known in chain.memories(self.key.folder, self.key.name):
-                if known.of == self._of:
-                    chain.require_remembered(known, None)
+        for known in self._memories():
+            if known.of == self._of:
+                chain.require_remembered(known, None)
+        signed = _signed_in(self.folder)
+        if signed is not None:
+            raise NotSigned(
+                f"{self.folder / chain.NAME} is gone, and {signed} was signed into it: put the chain back, or move "
+                "what is signed elsewhere"
+            )
+
+    def _memories(self) -> list[Memory]:
+        return [] if self.key.folder is None else chain.memories(self.key.folder)
 
     def _claims(self, number: int, previous: str) -> Claims:
         return Claims(self.key.name, to_text(self.key.public), iso_time(self.clock_ns()), number, previous)
@@ -126,9 +141,9 @@ class StationSigning:
         payload = canonical(document)
         return Entry(kind, claims.number, chain.digest_of(payload), recording, self._envelope(CHAIN_TYPE, payload))
 
-    def _envelope(self, payload_type: str, payload: bytes, *, stamped: bool = False) -> Envelope:
+    def _envelope(self, payload_type: str, payload: bytes) -> Envelope:
         signature = self.key.sign(pae(payload_type, payload))
-        stamp = stamps.stamp(self.authority, signature) if stamped and self.authority is not None else None
+        stamp = None if self.authority is None else stamps.stamp(self.authority, signature)
         return Envelope(payload_type, payload, self.key.id, signature, stamp)
 
     def require_works(self) -> None:
@@ -137,49 +152,61 @@ class StationSigning:
         try:
             if not verifies(self.key.public, self.key.sign(probe), probe):
                 raise InputError(f"key {self.key.name}: what it signs is not verified by its own public key")
-            if not (self.folder / chain.NAME).exists():
+            if not os.path.lexists(self.folder / chain.NAME):
                 self._require_new()
                 return
             with chain.locked(self.folder) as open_chain:
-                if open_chain.head is not None:
+                if open_chain.head is None:
+                    self._require_new()
+                else:
                     open_chain.settle()
-                    chain.require_remembered(self._remembered(open_chain), open_chain.head)
+                    self._require_remembered(open_chain)
         except OSError as e:
             raise InputError(f"{self.folder / chain.NAME}: cannot be written: {e.strerror}") from e
         except DaemonError as e:
             raise InputError(f"this station signs its recordings, and cannot: {e}") from e
 
 
-def _recording_in(contents: SealedContents) -> str | None:
-    """The name of the file, by its outcome."""
-    with suppress(ValueError, LookupError, TypeError, RecursionError):
-        return str(json_value(contents.document)["recording"])
-    return None
-
-
 def earlier_outcomes(folder: Path) -> list[str]:
-    """Digests of all outcomes in a folder and below it."""
+    """Digests of all outcomes in a folder and below it, in recordings and beside
+    them."""
     found = set()
     for path in folder.rglob(f"*{SUFFIX}"):
         with suppress(OSError):
             found.add(outcome_digest(path.read_bytes()))
+    for path in folder.rglob("*.mcap"):
+        found |= {outcome_digest(data) for data in indexed_attachments(path, ATTACHMENT).values()}
     return sorted(found)
+
+
+def _signed_in(folder: Path) -> Path | None:
+    """A signed recording, or a signature, that is of no chain below the folder."""
+    others = {path.parent for path in folder.rglob(chain.NAME)} - {folder}
+    for pattern in (f"*.{SIGNATURE_FILE}", "*.mcap"):
+        for path in sorted(folder.rglob(pattern)):
+            signed = path.suffix != ".mcap" or indexed_attachments(path, SIGNATURE_FILE)
+            if signed and not others & set(path.parents):
+                return path
+    return None
 
 
 # Which key a station has.
 
 
 def signing_of(station: Station) -> StationSigning | None:
-    """What signs the station's recordings, ready for use; None for a station without a
-    key. Raises InputError if it has one that cannot be used."""
-    sign = station.file.sign
-    key = _key_of(station, sign)
+    """What signs the station's recordings, ready for use; None for a station that has
+    neither a key nor anything that shows it signs. Raises InputError if its key is
+    missing, cannot be used, or is not in its trust file."""
+    sign, trust = station.file.sign, _trust_of(station)
+    key = _key_of(station, sign, trust)
     if key is None:
+        _require_never_signed(station, trust)
         return None
-    trust = trust_of(station.folder / "recording")
     known = None if trust is None else trust.key(key.id)
     if known is not None and known.revoked is not None:
         raise InputError(f"key {key.name}: revoked on {known.revoked}; `triaxcal keys new` makes another")
+    if trust is not None and known is None:
+        raise InputError(f"key {key.name}: not in {trust.path}; `triaxcal keys trust {key.name}` enters it")
     url = None if sign is None else sign.timestamp
     if url is not None:
         stamps.require_installed()
@@ -196,14 +223,31 @@ def key_folders(station: Station) -> list[Path]:
     return list(dict.fromkeys((beside / FOLDER, station.folder / FOLDER)))
 
 
+def _trust_of(station: Station) -> Trust | None:
+    """That by which its recordings are audited, else the one beside its file. Raises
+    InputError."""
+    found, beside = trust_of(station.folder / "recording"), station.path.parent / TRUST_FILE
+    return load_trust(beside) if found is None and os.path.lexists(beside) else found
+
+
+def _require_never_signed(station: Station, trust: Trust | None) -> None:
+    """Raises InputError where something says that the station signs."""
+    left = [path for folder in key_folders(station) for path in public_keys(folder)]
+    left += [] if trust is None else [trust.path]
+    left += [path for path in (station.folder / chain.NAME,) if os.path.lexists(path)]
+    if left:
+        told = " or ".join(map(str, key_folders(station)))
+        raise InputError(f"{left[0]}: this station signs its recordings, and there is no private key in {told}")
+
+
 _opened: dict[tuple[str, ...], SigningKey] = {}
 """Keys at work by what opened them: the work of scrypt is done once."""
 
 
-def _key_of(station: Station, sign: Sign | None) -> SigningKey | None:
+def _key_of(station: Station, sign: Sign | None, trust: Trust | None) -> SigningKey | None:
     if sign is not None and sign.pkcs11 is not None:
         return _of_token(station, sign)
-    path = _path_of(station, sign)
+    path = _path_of(station, sign, trust)
     if path is None:
         return None
     passphrase = _passphrase(station, sign)
@@ -234,11 +278,11 @@ def _passphrase(station: Station, sign: Sign | None) -> bytes | None:
     return passphrase_of(file)
 
 
-def _path_of(station: Station, sign: Sign | None) -> Path | None:
+def _path_of(station: Station, sign: Sign | None, trust: Trust | None) -> Path | None:
     folders = key_folders(station)
     if sign is not None and sign.key is not None:
         for folder in folders:
-            if (path := folder / f"{sign.key}{PRIVATE}").exists():
+            if (path := folder / f"{sign.key}{PRIVATE}") in private_keys(folder):
                 return path
         told = " or ".join(map(str, folders))
         raise InputError(f"{station.path}: sign.key: there is no {sign.key}{PRIVATE} in {told}")
@@ -247,7 +291,12 @@ def _path_of(station: Station, sign: Sign | None) -> Path | None:
         told = " or ".join(map(str, folders))
         raise InputError(f"{station.path}: sign: there is no key in {told}; `triaxcal keys new NAME` makes one")
     if len(found) > 1:
-        found = [path for path in found if not _revoked(path, trust_of(station.folder / "recording"))]
+        good = [path for path in found if not _revoked(path, trust)]
+        if not good:
+            raise InputError(
+                f"{found[0].parent}: each of its {len(found)} keys is revoked; `triaxcal keys new` makes another"
+            )
+        found = good
     if len(found) > 1:
         names = ", ".join(path.stem for path in found)
         raise InputError(f'{station.path}: sign.key: name one of {names}, as in [sign] key = "{found[0].stem}"')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import os
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -118,28 +119,34 @@ def load_trust(path: Path) -> Trust:
 
 def trust_of(recording: Path) -> Trust | None:
     """That of the nearest folder upwards that has one: the station's. Raises
-    InputError."""
+    InputError; Rejected as `nearest`."""
     path = nearest(recording.parent, NAME)
     return None if path is None else load_trust(path)
 
 
+class Rejected(InputError):
+    """A file above a folder that somebody else may have put there."""
+
+
 def nearest(folder: Path, name: str) -> Path | None:
-    """The file of that name in the folder, or in the nearest one above it. The search
-    ends at another file system, and at a folder of another owner: whoever can write
-    above all folders shall not choose the file."""
+    """The file of that name in the folder, or in the nearest one above it. Above, it
+    has to be root's, the user's or the owner's of the folder: whoever can write above
+    all folders shall not choose the file. Raises Rejected where it is another's, or
+    where nobody can tell."""
     try:
         folder = folder.resolve()
         while not folder.exists():
             folder = folder.parent
-        own = folder.stat()
+        owners = {0, getattr(os, "geteuid", int)(), folder.stat().st_uid}
         for within in (folder, *folder.parents):
-            found = within.stat()
-            if (found.st_uid, found.st_dev) != (own.st_uid, own.st_dev):
-                return None
-            if (within / name).is_file():
-                return within / name
-    except OSError:
-        return None
+            path = within / name
+            if not path.is_file():
+                continue
+            if within != folder and not {path.lstat().st_uid, path.stat().st_uid} <= owners:
+                raise Rejected(f"{path}: belongs to another user than {folder}; give the trust file by --trust")
+            return path
+    except OSError as e:
+        raise Rejected(f"{e.filename or folder}: {e.strerror}; give the trust file by --trust") from e
     return None
 
 

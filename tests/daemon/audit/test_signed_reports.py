@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.records import Metadata
 
 from tests.daemon.audit.forging import OUTCOME, Forgery
 from tests.daemon.signing.conftest import trusted
@@ -17,6 +18,7 @@ from tests.daemon.signing.line import SECOND_NS, sign_anew, when
 from triaxcald.audit import Audit, Policy, audit
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State
+from triaxcald.recording.schema import RECOVERY_RECORD, SIGNATURE_FILE
 from triaxcald.report import charts
 from triaxcald.signing.keys import new_key
 from triaxcald.signing.station import StationSigning
@@ -35,7 +37,7 @@ class Signed:
     run: Path
     auditor: Any
 
-    def audited(self, change: Change, *, trust: bool = True) -> Audit:
+    def audited(self, change: Change, *, trust: bool = True, mended: bool = False) -> Audit:
         forgery = Forgery.of(self.run)
         report = forgery.attachment(REPORT).data.decode()
         changed = change(report)
@@ -43,6 +45,8 @@ class Signed:
         digest = hashlib.sha256(changed.encode()).hexdigest()
         forgery.edit(OUTCOME, lambda o: o["sha256"].update({REPORT: digest}))
         forgery.seal()
+        if mended:
+            forgery.records.append(Metadata(RECOVERY_RECORD, {"of": "unit.mcap"}))
         path = forgery.write(self.folder / "unit.mcap")
         key = new_key(self.folder / "keys", "line", None)
         ended_ns = forgery.attachment(OUTCOME).log_time + SECOND_NS
@@ -70,6 +74,14 @@ def test_without_trust_the_pictures_are_drawn(signed: Signed) -> None:
     found = signed.audited(_other_line, trust=False)
     assert found.signature.state is State.UNTRUSTED
     assert (REPORT, Kind.NOT_DRAWN) in [(d.part, d.kind) for d in found.differences]
+    assert not found.notes.pictures_as_signed
+
+
+def test_in_a_recording_that_was_mended_the_pictures_are_drawn(signed: Signed) -> None:
+    """Anybody can leave one to be mended and signed."""
+    found = signed.audited(_other_line, mended=True)
+    assert (found.signature.state, found.signature.mended) == (State.TRUSTED, True)
+    assert {(REPORT, Kind.NOT_DRAWN), (SIGNATURE_FILE, Kind.MENDED)} <= {(d.part, d.kind) for d in found.differences}
     assert not found.notes.pictures_as_signed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -13,11 +14,13 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import Workshop
 from tests.daemon.audit.forging import Forgery
 from tests.daemon.signing.conftest import trusted
 from tests.daemon.signing.line import (
     SECOND_NS,
     Line,
+    batch,
     lines_of,
     looked_at,
     outcome_digest,
@@ -28,12 +31,20 @@ from tests.daemon.signing.line import (
 from triaxcald.audit import Policy, audit_chain, chains_in
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State
-from triaxcald.errors import InputError, NotSigned
+from triaxcald.cli.commands import main
+from triaxcald.errors import DiskError, InputError, NotSigned
 from triaxcald.outcome import ATTACHMENT
+from triaxcald.recording import disk
+from triaxcald.recording.manifest import Retention
 from triaxcald.recording.schema import SIGNATURE_FILE
+from triaxcald.recording.segments import SegmentedWriter
+from triaxcald.run.attempts import Attempts
 from triaxcald.signing import chain
 from triaxcald.signing.chain import OpenChain
 from triaxcald.signing.keys import SigningKey
+from triaxcald.signing.trust import load_trust
+from triaxcald.station.config import Limits
+from triaxcald.work import Attempt, Work
 
 Keys = dict[str, SigningKey]
 Make = Callable[[Line, Keys], object]
@@ -296,6 +307,51 @@ def test_a_start_that_lists_an_outcome_takes_only_that_one_for_earlier(recorded:
     assert first.earlier == {outcome_digest(recorded.made[0])}
 
 
+def test_the_start_lists_outcomes_that_are_in_recordings_alone(tmp_path: Path, key: SigningKey) -> None:
+    line = Line(tmp_path, key)
+    line.record("earlier.mcap", signed=False).with_suffix(f".{ATTACHMENT}").unlink()
+    line.record()
+    found = audit_chain(tmp_path)
+    assert (found.differences, found.earlier) == ((), 1)
+
+
+@pytest.mark.parametrize(("revoked", "older"), [({}, True), ({"revoked": when(0), "reason": "stolen"}, False)])
+def test_the_start_of_a_revoked_key_makes_nothing_older(line: Line, revoked: dict[str, str], older: bool) -> None:
+    path = line.folder / "trust.toml"
+    trusted(line.folder, load_trust(path).file.since, line.key, **revoked)
+    assert looked_at(line.made[0], Policy())[0].older is older
+
+
+@pytest.mark.parametrize("meanwhile", ["a run ends", "the first run ends", "a recording is deleted"])
+def test_what_happens_while_an_audit_reads_is_no_difference(
+    line: Line, monkeypatch: pytest.MonkeyPatch, meanwhile: str, tmp_path: Path
+) -> None:
+    if meanwhile == "the first run ends":
+        line = Line(tmp_path / "first", replace(line.key, folder=None))
+        line.folder.mkdir()
+    listed, once = Path.rglob, list[int]()
+
+    def happens() -> None:
+        if meanwhile == "a recording is deleted":
+            line.signing.bury(_digest(line, 2), "unit-0002.mcap", "age")
+            removed(line.made[2])
+        else:
+            for _ in range(2):
+                line.record()
+
+    def slow(path: Path, pattern: str) -> Any:
+        if pattern != "*.mcap" or once:
+            return listed(path, pattern)
+        once.append(1)
+        before = list(listed(path, pattern)) if meanwhile == "a run ends" else None
+        happens()
+        return listed(path, pattern) if before is None else before
+
+    monkeypatch.setattr(Path, "rglob", slow)
+    assert kinds(line) == []
+    assert once
+
+
 def test_a_folder_without_chain_and_signatures_is_an_error(tmp_path: Path, key: SigningKey) -> None:
     Line(tmp_path, key).record(signed=False)
     with pytest.raises(InputError):
@@ -448,27 +504,8 @@ def test_a_revoked_key_keeps_its_chain_but_not_its_trust(line: Line) -> None:
 
 def test_retention_signs_a_tombstone_for_each_segment_that_it_deletes(line: Line) -> None:
     """A segment for which none can be signed stays."""
-    from tests.daemon.signing.line import batch
-    from triaxcald.recording.manifest import Retention
-    from triaxcald.recording.segments import SegmentedWriter
-
-    def written(bury: Any) -> SegmentedWriter:
-        writer = SegmentedWriter(
-            line.folder / "log.segments.json", metadata={"bus": {}}, preview_channels=None, time_s=50.0,
-            retention=Retention(keep_s=100.0), bury=bury, clock_ns=lambda: line.now_ns, steady_ns=lambda: line.now_ns,
-        )  # fmt: skip
-        for i in range(5):
-            writer.raw("bus/0", batch(line.now_ns, i))
-            line.now_ns += 60 * SECOND_NS
-            writer.drain()
-        writer.close()
-        return writer
-
-    def cannot(*_: Any) -> None:
-        raise NotSigned("no key")
-
-    assert written(cannot).deleted == []
-    deleted = written(line.signing.bury).deleted
+    assert _written(line, _cannot, keep_s=100.0).deleted == []
+    deleted = _written(line, line.signing.bury, keep_s=100.0).deleted
     assert len(deleted) >= 3
     found = audit_chain(line.folder)
     assert (found.differences, found.tombstones) == ((), len(deleted))
@@ -478,10 +515,60 @@ def test_retention_signs_a_tombstone_for_each_segment_that_it_deletes(line: Line
     ]
 
 
-def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, tmp_path: Path) -> None:
-    from tests.conftest import Workshop
-    from triaxcald.cli.commands import main
+def _written(line: Line, bury: Any, batches: int = 5, **retention: Any) -> SegmentedWriter:
+    writer = SegmentedWriter(
+        line.folder / "log.segments.json", metadata={"bus": {}}, preview_channels=None, time_s=50.0,
+        retention=Retention(**retention), bury=bury, clock_ns=lambda: line.now_ns, steady_ns=lambda: line.now_ns,
+    )  # fmt: skip
+    for i in range(batches):
+        writer.raw("bus/0", batch(line.now_ns, i))
+        line.now_ns += 60 * SECOND_NS
+        writer.drain()
+    writer.close()
+    return writer
 
+
+def _cannot(*_: Any) -> None:
+    raise NotSigned("no key")
+
+
+def test_the_tombstone_of_a_segment_is_of_its_bytes_not_of_what_the_manifest_states(line: Line) -> None:
+    _written(line, _cannot, keep_s=100.0)
+    digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in line.folder.glob("log-*.mcap")}
+    manifest = line.folder / "log.segments.json"
+    document = json.loads(manifest.read_text())
+    for segment in document["segments"]:
+        segment["sha256"] = _digest(line, 2)  # of a signed recording
+    manifest.write_text(json.dumps(document))
+    buried: list[tuple[str, str]] = []
+    _written(line, lambda of, name, _: buried.append((name, of)), keep_s=100.0)
+    assert set(digests.items()) & set(buried)
+    assert _digest(line, 2) not in dict(buried).values()
+
+
+def test_a_recording_that_finds_no_room_says_that_nothing_can_be_signed(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _written(line, _cannot, keep_s=100.0)
+    monkeypatch.setattr(disk, "free_bytes", lambda _: disk.END_BYTES - 1)
+    with pytest.raises(DiskError, match="no deletion can be signed: no key"):
+        _written(line, _cannot, free_bytes=2**62)
+
+
+def test_a_segment_that_stays_is_buried_once(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink, buried = Path.unlink, list[str]()
+
+    def stays(path: Path, missing_ok: bool = False) -> None:
+        if path.suffix == ".mcap":
+            raise PermissionError(1, "not permitted")
+        unlink(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", stays)
+    _written(line, lambda _, name, __: buried.append(name), 12, keep_s=100.0)
+    assert len(buried) == len(set(buried)) >= 3
+
+
+def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, tmp_path: Path) -> None:
     station = Workshop(line.folder).station({"bus": {"host": "127.0.0.1", "port": 1}})
     delete = ["log", "delete", "--station", str(station), "--reason", "two years old"]
     assert main([*delete, str(line.made[2])]) == 2  # without a key
@@ -494,6 +581,80 @@ def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, 
     assert line.made[2].with_suffix(f".{ATTACHMENT}").exists()
     found = audit_chain(line.folder)
     assert (found.differences, found.tombstones) == ((), 1)
+
+
+@pytest.fixture
+def delete(line: Line, key: SigningKey) -> list[str]:
+    """The command, of a station that has its key."""
+    assert key.folder is not None
+    shutil.copy(key.folder / "line-1.key", line.folder / "keys")
+    station = Workshop(line.folder).station({"bus": {"host": "127.0.0.1", "port": 1}})
+    return ["log", "delete", "--json", "--station", str(station), "--reason", "age"]
+
+
+def _cut_short(line: Line) -> None:
+    data = line.made[2].read_bytes()
+    line.made[2].write_bytes(data[: len(data) // 2])
+
+
+def _empty(line: Line) -> None:
+    line.made[2].write_bytes(b"")
+
+
+def _under_way(line: Line) -> None:
+    attempts = Attempts(line.folder, "tray", "bench", Limits().model_dump())
+    with attempts.under_way():
+        attempts.begin(Attempt("run", when(line.now_ns), Work("unit", "1"), recording=line.made[2].name))
+
+
+@pytest.mark.parametrize("make", [_cut_short, _empty, _under_way])
+def test_a_recording_that_is_being_made_is_not_deleted(
+    line: Line, delete: list[str], make: Callable[[Line], None]
+) -> None:
+    make(line)
+    assert main([*delete, str(line.made[1]), str(line.made[2])]) == 2
+    assert all(path.exists() for path in line.made)
+    assert len(lines_of(line.folder)) == 5
+
+
+def test_a_recording_that_is_named_twice_gets_one_tombstone(
+    line: Line, delete: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(line.folder)
+    assert main([*delete, str(line.made[2]), line.made[2].name]) == 0
+    assert json.loads(capsys.readouterr().out)["deleted"] == [str(line.made[2])]
+    found = audit_chain(line.folder)
+    assert (found.differences, found.tombstones) == ((), 1)
+
+
+def test_what_was_deleted_is_told_where_the_next_one_fails(
+    line: Line, delete: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line.made[3].with_suffix(".report.html").mkdir()
+    assert main([*delete, *map(str, line.made[2:4])]) == 2
+    assert json.loads(capsys.readouterr().out)["deleted"] == [str(line.made[2])]
+    assert [path.exists() for path in line.made[2:4]] == [False, True]
+    assert kinds(line) == []
+
+
+@pytest.mark.parametrize("of", ["a copy with another name", "a recording with the envelope of another"])
+def test_a_tombstone_of_one_recording_does_not_bury_another(line: Line, delete: list[str], of: str) -> None:
+    other = line.folder / "other.mcap"
+    if of == "a copy with another name":
+        shutil.copy(line.made[2], other)
+    else:
+        line.record("other.mcap", signed=False)
+        put_signature(other, Forgery.of(line.made[2]).attachment(SIGNATURE_FILE).data)
+    assert main([*delete, str(other)]) == 0
+    assert kinds(line) == []
+    removed(line.made[2])
+    assert kinds(line) == [Kind.REMOVED]
+
+
+def test_a_tombstone_under_another_name_is_of_no_entry(line: Line) -> None:
+    line.signing.bury(_digest(line, 2), "other.mcap", "age")
+    removed(line.made[2])
+    assert kinds(line) == [Kind.REMOVED]
 
 
 def test_a_station_whose_chain_is_gone_does_not_begin_another(line: Line, key: SigningKey) -> None:
@@ -509,9 +670,13 @@ def test_a_station_whose_chain_is_gone_does_not_begin_another(line: Line, key: S
     for memory in chain.memories(line.folder / "keys"):
         if memory.of == str(other.folder.resolve()):
             memory.path.unlink()
+    with pytest.raises(InputError):  # what was signed into it is still there
+        other.signing.require_works()
+    for path in other.folder.glob("unit-*.m*"):
+        path.unlink()
     other.signing.require_works()
     other.record("again.mcap")
-    assert [d.kind for d in audit_chain(other.folder).differences] == [Kind.INSERTED]
+    assert audit_chain(other.folder).differences == ()
 
 
 def test_each_chain_below_a_folder_is_its_own(line: Line, keys: Keys) -> None:
@@ -522,3 +687,41 @@ def test_each_chain_below_a_folder_is_its_own(line: Line, keys: Keys) -> None:
     assert chains_in(line.folder.parent) == [line.folder, below]
     assert [audit_chain(folder).differences for folder in chains_in(line.folder)] == [(), ()]
     assert chains_in(below / "nowhere") == [below / "nowhere"]
+
+
+@pytest.mark.parametrize("left", ["recordings", "signatures", "the memory"])
+def test_a_chain_below_does_not_hide_that_the_folder_s_own_is_gone(line: Line, left: str) -> None:
+    below = line.folder / "station-2"
+    below.mkdir()
+    Line(below, line.key, line.now_ns).record("other.mcap")
+    line.record()  # by which the key remembers the folder where it is now
+    (line.folder / chain.NAME).unlink()
+    if left != "recordings":
+        for path in line.folder.glob("*.mcap"):
+            path.unlink()
+    if left == "the memory":
+        for path in line.folder.glob("unit-*"):
+            path.unlink()
+    for asked in (line.folder, line.folder.parent):
+        assert chains_in(asked) == [asked, below]
+        found = {d.kind for folder in chains_in(asked) for d in audit_chain(folder).differences}
+        assert Kind.NO_CHAIN in found
+
+
+def test_a_chain_that_is_elsewhere_is_not_missed_here(line: Line, tmp_path: Path) -> None:
+    """The key also signs in another folder."""
+    (tmp_path / "other").mkdir()
+    Line(tmp_path / "other", line.key, line.now_ns).record("other.mcap")
+    assert chains_in(line.folder) == [line.folder]
+    assert kinds(line) == []
+
+
+def test_what_the_key_remembers_is_looked_for_in_all_folders_above(line: Line, keys: Keys) -> None:
+    runs = line.folder / "a" / "b" / "runs"
+    runs.mkdir(parents=True)
+    other = Line(runs, line.key, line.now_ns)
+    for _ in range(2):
+        other.record()
+    removed(other.made[1])
+    write_lines(runs, lines_of(runs)[:2])
+    assert [d.kind for d in audit_chain(runs).differences] == [Kind.CUT]

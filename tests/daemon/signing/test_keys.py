@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import stat
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from triaxcald.audit import Policy
 from triaxcald.cli.commands import main
 from triaxcald.errors import InputError
 from triaxcald.signing.keys import (
@@ -151,6 +153,50 @@ def test_a_key_is_made_trusted_and_revoked(folder: Path, capsys: pytest.CaptureF
     assert listed() == {"line-1": "revoked"}
 
 
+def test_keys_are_listed_by_what_they_are_not_by_their_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    ids = {name: new_key(folder / "keys", name, None).id for name in ("a", "b", "c")}
+    for name, file in (("b", "a"), ("other", "b")):  # the key in a.pub is trusted as b, that in b.pub as other
+        assert main(["keys", "trust", name, "--public", f"keys/{file}.pub"]) == 0
+    (folder / "keys" / "b.pub").unlink()
+    assert main(["keys", "revoke", "b", "--reason", "stolen"]) == 0
+    capsys.readouterr()
+    assert main(["keys", "list", "--json"]) == 0
+    rows = [(key["name"], key["key"], key["state"]) for key in json.loads(capsys.readouterr().out)["keys"]]
+    assert rows == [("a", ids["a"], "revoked"), ("c", ids["c"], "not trusted"), ("other", ids["b"], "trusted")]
+
+
+@pytest.mark.parametrize("command", [
+    ["keys", "revoke", "line-1"], ["log", "delete", "a.mcap", "--station", "station.toml"],
+])  # fmt: skip
+def test_a_reason_is_text(folder: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    new_key(folder / "keys", "line-1", None)
+    assert main(["keys", "trust", "line-1"]) == 0
+    capsys.readouterr()
+    assert main([*command, "--reason", "gestohlen, \udcfcbrigens"]) == 2  # Latin-1 on the command line
+    assert "--reason" in capsys.readouterr().err
+
+
+def test_a_private_key_is_at_no_moment_for_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[int] = []
+    of_os = os.open
+
+    def opened(path: str, flags: int, mode: int = 0o777, **rest: int) -> int:
+        found = of_os(path, flags, mode, **rest)
+        if str(path).endswith(".key"):
+            modes.append(_mode(Path(path)))
+        return found
+
+    before = os.umask(0)
+    try:
+        monkeypatch.setattr(os, "open", opened)
+        new_key(tmp_path, "a", None)
+    finally:
+        os.umask(before)
+    assert modes == [0o600]
+
+
 def test_a_new_key_takes_the_passphrase_of_the_environment_or_of_a_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +239,38 @@ def test_the_trust_file_is_that_of_the_nearest_folder(tmp_path: Path) -> None:
     assert found.since.isoformat() == "2026-01-01T00:00:00+00:00"
     assert nearest(within / "not" / "there", "trust.toml") == found.path
     assert nearest(tmp_path, "no such file") is None
+
+
+TRUST = 'format = "triaxcal.trust/1"\nsince = 2026-01-01T00:00:00Z\n'
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="gives files to other users")
+def test_above_a_folder_the_trust_file_is_root_s_the_user_s_or_the_owner_s(tmp_path: Path) -> None:
+    within = tmp_path / "station"
+    within.mkdir()
+    file = tmp_path / "trust.toml"
+    file.write_text(TRUST)
+    for folder, owner in ((0, 0), (4711, 0), (4711, 4711)):
+        os.chown(within, folder, -1)
+        os.chown(file, owner, -1)
+        assert Policy().trust_of(within / "a.mcap") is not None
+    os.chown(file, 4712, -1)
+    with pytest.raises(InputError, match="--trust"):  # it is there, so it is not as if there were none
+        Policy().trust_of(within / "a.mcap")
+    assert Policy(trust=file).trust_of(within / "a.mcap") is not None
+    (within / "trust.toml").write_text(TRUST)
+    assert nearest(within, "trust.toml") == within / "trust.toml"
+
+
+def test_the_trust_file_of_the_folder_asked_for_counts_for_all_below(tmp_path: Path) -> None:
+    within = tmp_path / "station" / "2026"
+    within.mkdir(parents=True)
+    for folder in (tmp_path / "station", within):
+        (folder / "trust.toml").write_text(TRUST)
+    recording = within / "a.mcap"
+    assert Policy().file_of(recording) == within / "trust.toml"
+    assert Policy(folders=(tmp_path / "station",)).file_of(recording) == tmp_path / "station" / "trust.toml"
+    assert Policy(folders=(tmp_path,)).file_of(recording) == within / "trust.toml"  # it has none itself
 
 
 @pytest.mark.parametrize(("module", "extra"), [("cryptography", "sign"), ("pkcs11", "hsm"), ("rfc3161_client", "sign")])

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from tests.daemon.signing.conftest import trusted
-from tests.daemon.signing.line import Line, envelope_of, looked_at, put_signature
-from triaxcald.audit import Policy
+from tests.daemon.signing.line import Line, envelope_of, lines_of, looked_at, put_signature
+from triaxcald.audit import Policy, audit_chain
 from triaxcald.audit.differences import Kind
 from triaxcald.audit.signature import State, stamp_asked_for
 from triaxcald.cli.commands import main
@@ -181,6 +181,23 @@ def test_a_stamp_from_before_the_revocation_keeps_a_signature_trusted(stamped: L
     earlier = (datetime.now(UTC) - timedelta(hours=1)).isoformat()
     (stamped.folder / "trust.toml").write_text((stamped.folder / "trust.toml").read_text().replace(later, earlier))
     assert looked_at(stamped.made[0], Policy())[0].state is State.REVOKED
+
+
+def test_a_stamped_chain_outlives_the_revocation_of_its_key(stamped: Line, authority: Authority) -> None:
+    """The start and a tombstone too."""
+    folder = str(stamped.folder)
+    assert main(["keys", "trust", "theirs", "--authority", str(authority.root), "--folder", folder]) == 0
+    stamped.now_ns = _now_ns() - 60 * 10**9
+    gone = stamped.record()
+    stamped.signing.bury(lines_of(stamped.folder)[-1]["digest"], gone.name, "age")
+    for path in stamped.folder.glob(f"{gone.stem}.m*"):
+        path.unlink()
+    assert audit_chain(stamped.folder).differences == ()
+    text = (stamped.folder / "trust.toml").read_text()
+    revoked = f'name = "line-1"\nrevoked = "{(datetime.now(UTC) + timedelta(hours=1)).isoformat()}"\n'
+    (stamped.folder / "trust.toml").write_text(text.replace('name = "line-1"\n', revoked))
+    found = audit_chain(stamped.folder)
+    assert (found.differences, found.recordings, found.tombstones) == ((), 2, 1)
 
 
 @pytest.mark.parametrize("answer", [b"", b"no stamp", b"\x30\x03\x02\x01\x02"])
