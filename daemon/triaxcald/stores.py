@@ -195,6 +195,19 @@ def files_under(url: str, endings: tuple[str, ...]) -> list[Listed]:
         ]
 
 
+def files_in(folder: StoreFile) -> dict[str, Listed]:
+    """Files of a folder of a store by name, by one request or a few. Raises OSError."""
+    url = str(folder)
+    with _told(url):
+        fs, path = _file_system(url)
+        found = fs.ls(path, detail=True)
+        return {
+            posixpath.basename(info["name"]): _listed(fs.unstrip_protocol(info["name"]), info)
+            for info in found
+            if info.get("type") != "directory"
+        }
+
+
 def files_like(url: str) -> list[Listed]:
     """Files whose names match a pattern, in order. Raises OSError."""
     with _told(url):

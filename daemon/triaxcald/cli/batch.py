@@ -33,6 +33,7 @@ from triaxcald.errors import DONE, OUTSIDE, DiskError, InputError
 from triaxcald.files import is_of_the_disk
 from triaxcald.inputs import DOCUMENT_MOST, Measured, document_bytes, parse_document
 from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Done, Finding, Found, Source, Unusable, sources_of
+from triaxcald.many.beside import with_files_beside
 from triaxcald.many.sources import MANIFEST
 from triaxcald.many.work import Cell, Row
 from triaxcald.schema.columns import Kind
@@ -81,16 +82,15 @@ class Calibration:
     @classmethod
     def beside(cls, path: td.files.AnyPath) -> Calibration:
         """Of a recording: raises InputError where none is beside it."""
-        stem = stem_of(path.name)
-        for ending in BESIDE_ENDINGS:
-            file = path.with_name(stem + ending)
+        files = _calibrations_beside(path)
+        for file in files:
             try:
                 return cls(str(file), td.files.read_whole(file, DOCUMENT_MOST))
             except FileNotFoundError:
                 continue
             except OSError as e:
                 raise InputError(f"{file}: cannot be read: {e.strerror or e}") from e
-        names = ", ".join(stem + ending for ending in BESIDE_ENDINGS)
+        names = ", ".join(file.name for file in files)
         raise InputError(f"{path}: no calibration is beside it, expected one of {names}")
 
     def document(self) -> Mapping[str, Any]:
@@ -415,7 +415,7 @@ def batch_command(a: argparse.Namespace) -> int:
     task = _task(a)
     found = [of for of in sources_of(a.recordings, ENDINGS, without=own_files(a)) if not _is_output(of, task)]
     if task.calibration is None and getattr(a, "calibration", None) == BESIDE:
-        found = [_with_calibration(of) if isinstance(of, Source) else of for of in found]
+        found = with_files_beside(found, _calibrations_beside)
     if task.command == "apply":
         _require_apart(found, task)
     counts: Counter[str] = Counter()
@@ -473,19 +473,9 @@ def _said(task: Task) -> str:
     return said_options({**plain, **digests, "calibration": calibration, "to": task.to, "ending": task.ending})
 
 
-def _with_calibration(of: Source) -> Source:
-    """A recording counts as changed, too, where the calibration beside it has. That of
-    a store would take a request for each."""
-    if is_url(of.name):
-        return of
-    for ending in BESIDE_ENDINGS:
-        path = Path(of.name)
-        try:
-            status = path.with_name(stem_of(path.name) + ending).stat()
-        except OSError:
-            continue
-        return Source(of.name, of.size, f"{of.stamp}+{status.st_mtime_ns}")
-    return of
+def _calibrations_beside(path: td.files.AnyPath) -> list[td.files.AnyPath]:
+    """Files that `Calibration.beside` looks for."""
+    return [path.with_name(stem_of(path.name) + ending) for ending in BESIDE_ENDINGS]
 
 
 def _is_output(of: Found, task: Task) -> bool:

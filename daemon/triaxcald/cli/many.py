@@ -244,8 +244,8 @@ def audit_command(a: argparse.Namespace) -> int:
     found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS)
     if a.as_made:
         return _audit_as_made(a, found)
-    if a.resume and a.output is None:
-        raise InputError("--resume: give the table that is to be finished: -o TABLE")
+    if a.output is not None:
+        found = many.with_files_beside(found)
     counts: Counter[str] = Counter()
     documents: dict[str, dict[str, Any]] = {}
 

@@ -51,7 +51,11 @@ COMMON_AFTER: Final = (
     _common("error", Kind.TEXT, "why there is no result; else empty"),
     _common("seconds", Kind.NUMBER, "time that it took [s]"),
     _common("size", Kind.WHOLE, "size of the file [bytes]"),
-    _common("stamp", Kind.TEXT, "modification time [ns since 1970], or the store's ETag"),
+    _common(
+        "stamp",
+        Kind.TEXT,
+        "modification time [ns since 1970], or the store's ETag; after a `+` a digest of those of files beside it",
+    ),
     _common("sha256", Kind.TEXT, "SHA-256 of the file"),
     _common("software", Kind.TEXT, "version of triaxcal that computed the row"),
     _common("settings", Kind.TEXT, "digest of command and options"),
