@@ -56,8 +56,10 @@ def is_current(row: Row, of: Source, settings: Settings) -> bool:
     software and settings, and would not come out otherwise another time."""
     if row["exit_code"] in _AGAIN or not (of.stamp or of.size):
         return False
+    if row["error"] and not row["sha256"]:  # never read: for lack of a right, a mount or a package
+        return False
     now = (of.size, of.stamp, settings.software, settings.digest)
-    return now == (row["size"], row["stamp"], row["software"], row["settings"])
+    return now == (row["size"], row["stamp"] or "", row["software"], row["settings"])
 
 
 class Table(ABC):

@@ -127,6 +127,8 @@ def test_a_journal_cut_within_its_first_line_begins_anew(tmp_path: Path) -> None
         ({"exit_code": 1}, True),
         ({"exit_code": 2, "error": "broken"}, True),
         ({"exit_code": 3, "error": "refused"}, True),
+        ({"exit_code": 2, "error": "the store refuses", "sha256": None}, False),
+        ({"exit_code": 3, "error": "refused", "sha256": ""}, False),
         ({"exit_code": 4, "error": "internal"}, False),
         ({"exit_code": 5, "error": "memory ran out"}, False),
     ],
@@ -134,6 +136,12 @@ def test_a_journal_cut_within_its_first_line_begins_anew(tmp_path: Path) -> None
 )
 def test_a_row_counts_where_nothing_has_changed(change: dict[str, Any], current: bool) -> None:
     assert is_current(row_of(SOURCE.name, **change), SOURCE, SETTINGS) is current
+
+
+def test_a_stamp_that_is_empty_reads_back_as_such() -> None:
+    unstamped = replace(SOURCE, stamp="")
+    for stored in ("", None):
+        assert is_current(row_of(SOURCE.name, stamp=stored), unstamped, SETTINGS)
 
 
 def test_a_recording_of_which_nothing_is_known_is_never_taken_over() -> None:
