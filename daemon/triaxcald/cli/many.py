@@ -84,7 +84,7 @@ def run_job(job: Job, a: argparse.Namespace) -> int:
             codes.add(done.exit_code)
             job.each(done)
             sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
-        table.finish(of.name for of in job.found)
+        table.finish((of.name for of in job.found), a.recordings)
     return severest(codes)
 
 
