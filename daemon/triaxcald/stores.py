@@ -42,7 +42,10 @@ def path_of(name: str) -> td.files.AnyPath:
     if not is_url(name):
         return Path(name)
     if name.startswith("file://"):
-        return Path(unquote(urlsplit(name).path))
+        try:
+            return Path(unquote(urlsplit(name).path))
+        except ValueError as e:
+            raise InputError(f"{name}: {e}") from e
     return StoreFile(name)
 
 
