@@ -61,7 +61,7 @@ def trust_digests(found: Iterable[Found], policy: Policy) -> list[tuple[str, str
     error of that recording alone. Raises InputError, ProfileError for the file that was
     given."""
     if policy.trust is not None:
-        return [(str(policy.trust), _trust_digest(policy.trust))]
+        return [("", _trust_digest(policy.trust))]  # wherever it lies
     paths = {path.parent: path for of in found if not is_url(of.name) for path in (Path(of.name),)}
     files = {file for path in paths.values() if (file := policy.file_of(path)) is not None}
     digests = []
