@@ -129,6 +129,15 @@ def synchronise(folder: Path) -> None:
         os.close(descriptor)
 
 
+def synchronise_file(path: Path) -> None:
+    """What was written to it is on the disk. Raises OSError."""
+    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def require_writable(path: Path) -> None:
     """Raises InputError where ``path`` is a symbolic link to a file, or to
     nothing."""
@@ -164,7 +173,8 @@ def replace_bytes(path: Path, data: bytes) -> None:
 @contextmanager
 def new_beside(path: Path) -> Iterator[Path]:
     """A temporary file beside ``path``, empty, which takes its place where the
-    context comes to its end and is gone where it does not. Raises OSError."""
+    context comes to its end, and is on the disk then; it is gone where the context
+    does not. Raises OSError."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():
@@ -173,7 +183,9 @@ def new_beside(path: Path) -> Iterator[Path]:
     with new_file(temporary) as file:
         file.close()
         yield temporary
+        synchronise_file(temporary)
         os.replace(temporary, path)
+    synchronise(path.parent)
 
 
 @contextmanager

@@ -42,7 +42,10 @@ def path_of(name: str) -> td.files.AnyPath:
     if not is_url(name):
         return Path(name)
     if name.startswith("file://"):
-        return Path(unquote(urlsplit(name).path))
+        try:
+            return Path(unquote(urlsplit(name).path))
+        except ValueError as e:
+            raise InputError(f"{name}: {e}") from e
     return StoreFile(name)
 
 
@@ -193,6 +196,19 @@ def files_under(url: str, endings: tuple[str, ...]) -> list[Listed]:
         return [
             _listed(fs.unstrip_protocol(name), info) for name, info in sorted(found.items()) if name.endswith(endings)
         ]
+
+
+def files_in(folder: StoreFile) -> dict[str, Listed]:
+    """Files of a folder of a store by name, by one request or a few. Raises OSError."""
+    url = str(folder)
+    with _told(url):
+        fs, path = _file_system(url)
+        found = fs.ls(path, detail=True)
+        return {
+            posixpath.basename(info["name"]): _listed(fs.unstrip_protocol(info["name"]), info)
+            for info in found
+            if info.get("type") != "directory"
+        }
 
 
 def files_like(url: str) -> list[Listed]:

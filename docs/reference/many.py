@@ -16,7 +16,7 @@ HEAD = """# Tables of many recordings
 
 `triaxcal audit … -o TABLE` and [`triaxcal batch`](cli.md#triaxcal-batch-poses) write a row for each recording. The name of TABLE decides: `.parquet`, `.csv`, `.csv.gz` or `.sqlite` (table `recordings`). [How to](../how-to/audit-many-recordings.md). An empty cell is `NULL` in SQLite and Parquet. Made from the columns in the code by `docs/reference/many.py`.
 
-Rows are stored as they come: in SQLite by one transaction each, otherwise in `TABLE.journal`, a JSON object a line. At the end CSV and Parquet are written whole, in the order in which the recordings were given, and the journal goes; rows of SQLite are in the order in which they came. `--resume` takes a row over if size, stamp and SHA-256 of command and options are the same and the same version of triaxcal made it. Rows with exit code 4 or 5 (a worker died, memory ran out, a store or a disk failed) are made again. Rows of other recordings stay.
+Rows are stored as they come: in SQLite by one transaction each, otherwise in `TABLE.journal`, a JSON object a line. At the end CSV and Parquet are written whole, in the order in which the recordings were given, and the journal goes; rows of SQLite are in the order in which they came. `--resume` takes a row over if size, stamp and SHA-256 of command and options are the same and the same version of triaxcal made it. Rows with exit code 4 or 5 (a worker died, memory ran out, a store or a disk failed) are made again, and those with an error and without `sha256`: the recording could not be read. Rows of other recordings stay.
 
 ## Columns of every table
 

@@ -35,11 +35,14 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.audit import text
+from triaxcald.audit.signature import Policy
+from triaxcald.audit.signature import check as check_signature
 from triaxcald.audit.wheels import Target, Wheels
 from triaxcald.computer import KEYS
 from triaxcald.errors import (
     DONE,
     INTERRUPTED,
+    OUTSIDE,
     SEVEREST,
     DaemonError,
     InputError,
@@ -48,8 +51,10 @@ from triaxcald.errors import (
     severest,
 )
 from triaxcald.many.sources import Unusable
+from triaxcald.outcome import ATTACHMENT
 from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.survey import survey
 
 SELF = "triaxcal"
 SIGNED = "triaxcal[sign]"
@@ -315,12 +320,27 @@ def grouped(asked: Iterable[Path]) -> tuple[dict[Software, list[Path]], list[Unu
     return found, failed
 
 
+def unproven(recordings: Iterable[Path], policy: Policy) -> list[Unusable]:
+    """Recordings whose signatures do not pass, by this version's ``policy``."""
+    found = []
+    for path in recordings:
+        try:
+            with Recording.open(path) as recording:
+                attachments = {name: data for name, data in recording.attachments.items() if "/" not in name}
+                _, differences = check_signature(path, attachments, survey(recording, ATTACHMENT), policy)
+            found += [Unusable(str(path), f"{path}: {text.difference(d)}", OUTSIDE) for d in differences]
+        except (DaemonError, td.DriverError, td.ProfileError) as e:
+            found.append(Unusable(str(path), str(e), exit_code_of(e)))
+    return found
+
+
 def audit_as_made(
     software: Software,
     recordings: Sequence[Path],
     wheels: Wheels,
     *,
     as_json: bool,
+    policy: Policy,
     begins: Callable[[str], None],
     notes: Callable[[str], None],
 ) -> Iterator[Part]:
@@ -342,12 +362,24 @@ def audit_as_made(
     for i in range(0, len(recordings), RECORDINGS_MOST):
         some = tuple(recordings[i : i + RECORDINGS_MOST])
         notes(f"note: {tc.number_format.number_of(len(some), 'recording')} under {software}")
-        yield _audited(inner, some, as_json=as_json)
+        yield _audited(inner, some, [*(["--json"] if as_json else []), *_known_there(inner, policy)], as_json=as_json)
 
 
-def _audited(python: Path, recordings: tuple[Path, ...], *, as_json: bool) -> Part:
+def _known_there(python: Path, policy: Policy) -> list[str]:
+    """The options of the ``policy``, as far as that version has them; one without them
+    checks no signature."""
+    options = [] if policy.trust is None else ["--trust", str(policy.trust.absolute())]
+    options += ["--allow-unsigned"] if policy.allow_unsigned else []
+    if not options:
+        return []
+    help_ = subprocess.run(
+        [python, "-I", "-c", _ENTRY, "audit", "--help"], stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
+    return options if b"--allow-unsigned" in help_.stdout else []
+
+
+def _audited(python: Path, recordings: tuple[Path, ...], options: list[str], *, as_json: bool) -> Part:
     sys.stdout.flush()
-    options = ["--json"] if as_json else []
     process = subprocess.Popen(
         [python, "-I", "-c", _ENTRY, "audit", *options, "--", *recordings],
         stdin=subprocess.DEVNULL,

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
 import triaxcal_drivers as td
 from triaxcald.audit import text
+from triaxcald.audit.beside import NAMES
 from triaxcald.audit.conduct import Audit, audit
 from triaxcald.audit.signature import Policy
-from triaxcald.errors import DONE, OUTSIDE
-from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding, Found
+from triaxcald.errors import DONE, OUTSIDE, DaemonError
+from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding, Found, beside
 from triaxcald.many.sources import LIST
 from triaxcald.schema.columns import Kind
-from triaxcald.signing.trust import load_trust
+from triaxcald.signing.chain import NAME as CHAIN
+from triaxcald.signing.trust import load_trust, nearest
 from triaxcald.stores import is_url
 
 ENDINGS: Final = (".mcap",)
 """Ends of names of recordings in a folder."""
 MANIFESTS: Final = (*LIST, ".txt")
 """Ends of names of manifests: no text is a recording that could be audited."""
+
+LINE_MOST: Final = 2**24
+"""Bytes of a chain's first line that count: it lists the recordings from before."""
 
 COLUMNS: Final[tuple[Column[Audit], ...]] = (
     *COMMON_BEFORE,
@@ -51,10 +57,46 @@ COLUMNS: Final[tuple[Column[Audit], ...]] = (
 
 def trust_digests(found: Iterable[Found], policy: Policy) -> list[tuple[str, str]]:
     """The trust files of recordings, with their SHA-256: a row that was stored under
-    another one is done again. Raises InputError."""
+    another one is done again. One that lies above a recording and cannot be used is an
+    error of that recording alone. Raises InputError, ProfileError for the file that was
+    given."""
+    if policy.trust is not None:
+        return [("", _trust_digest(policy.trust))]  # wherever it lies
     paths = {path.parent: path for of in found if not is_url(of.name) for path in (Path(of.name),)}
     files = {file for path in paths.values() if (file := policy.file_of(path)) is not None}
-    return sorted((str(file), sha256(load_trust(file).file.model_dump_json().encode()).hexdigest()) for file in files)
+    digests = []
+    for file in sorted(files):
+        try:
+            digests.append((str(file), _trust_digest(file)))
+        except (DaemonError, td.ProfileError) as e:
+            digests.append((str(file), f"unusable: {e}"))
+    return digests
+
+
+def _trust_digest(file: Path) -> str:
+    return sha256(load_trust(file).file.model_dump_json().encode()).hexdigest()
+
+
+def with_files_beside(found: Iterable[Found]) -> list[Found]:
+    """Recordings whose stamps change with the files beside them, and with the start of
+    the chain, which an audit compares with them."""
+
+    @lru_cache(maxsize=1024)
+    def start_of(folder: Path) -> str:
+        at = nearest(folder, CHAIN)
+        if at is None:
+            return ""
+        try:
+            with at.open("rb") as file:
+                return sha256(file.readline(LINE_MOST)).hexdigest()
+        except OSError as e:
+            return f"unreadable: {e.strerror}"
+
+    return beside.with_files_beside(
+        found,
+        lambda path: [path.with_suffix(f".{name}") for name in NAMES],
+        lambda path: start_of(path.parent) if isinstance(path, Path) else "",
+    )
 
 
 def audited(

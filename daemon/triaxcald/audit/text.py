@@ -195,7 +195,17 @@ def chained(of: ChainAudit) -> list[str]:
 
 def chain_document(of: ChainAudit) -> dict[str, Any]:
     """An entry of `chains` in `triaxcal.audit/1`."""
-    return {**of.document(), "differences": [difference(d) for d in of.differences], "codes": codes(of.differences)}
+    return {
+        **of.document(),
+        "differences": [difference(d) for d in of.differences],
+        "codes": codes(of.differences),
+        "error": None,
+    }
+
+
+def chain_error(folder: str, error: str) -> dict[str, Any]:
+    """The entry of a folder whose chain cannot be audited."""
+    return {**chain_document(ChainAudit(folder, ())), "error": error}
 
 
 def codes(of: Sequence[Difference]) -> list[str]:

@@ -10,10 +10,11 @@ import argparse
 import json
 import os
 import re
+import secrets
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -30,9 +31,10 @@ from triaxcald.cli.many import Job, own_files, run_job, said_options
 from triaxcald.cli.measuring import applied_as, found_poses, require_own_times, verified_by, written
 from triaxcald.cli.showing import judge
 from triaxcald.errors import DONE, OUTSIDE, DiskError, InputError
-from triaxcald.files import is_of_the_disk
+from triaxcald.files import is_of_the_disk, synchronise_file
 from triaxcald.inputs import DOCUMENT_MOST, Measured, document_bytes, parse_document
 from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Done, Finding, Found, Source, Unusable, sources_of
+from triaxcald.many.beside import with_files_beside
 from triaxcald.many.sources import MANIFEST
 from triaxcald.many.work import Cell, Row
 from triaxcald.schema.columns import Kind
@@ -42,6 +44,9 @@ ENDINGS: Final = (".mcap", MANIFEST, ".csv", ".csv.gz", ".parquet")
 """Ends of names of recordings in a folder. Other tables are named one by one."""
 STEM: Final = re.compile(r"(.+?)(?:\.mcap|\.segments\.json|\.csv|\.csv\.gz|\.txt|\.txt\.gz|\.parquet|\.pq)?")
 BESIDE: Final = "beside"
+PART: Final = ".part"
+"""End of the name of a file that is being written."""
+_PART: Final = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}{re.escape(PART)}")
 BESIDE_ENDINGS: Final = (".cal.json", ".calibration.json", ".certificate.json")
 """Ends of names of a calibration beside a recording; the first that is there counts."""
 FILES: Final = ("attitudes", "datasheet", "odds")
@@ -81,16 +86,15 @@ class Calibration:
     @classmethod
     def beside(cls, path: td.files.AnyPath) -> Calibration:
         """Of a recording: raises InputError where none is beside it."""
-        stem = stem_of(path.name)
-        for ending in BESIDE_ENDINGS:
-            file = path.with_name(stem + ending)
+        files = _calibrations_beside(path)
+        for file in files:
             try:
                 return cls(str(file), td.files.read_whole(file, DOCUMENT_MOST))
             except FileNotFoundError:
                 continue
             except OSError as e:
                 raise InputError(f"{file}: cannot be read: {e.strerror or e}") from e
-        names = ", ".join(stem + ending for ending in BESIDE_ENDINGS)
+        names = ", ".join(file.name for file in files)
         raise InputError(f"{path}: no calibration is beside it, expected one of {names}")
 
     def document(self) -> Mapping[str, Any]:
@@ -387,10 +391,10 @@ def _apply(task: Task, a: argparse.Namespace, path: td.files.AnyPath) -> _Worked
     calibration = task.calibration_of(path)
     found = applied_as(a, calibration.calibration())
     final = task.final(str(path))
-    temporary = final.with_name(f".{final.name}.part")
+    temporary = final.with_name(f".{final.name}.{secrets.token_hex(4)}{PART}")  # a worker that seemed dead has another
     try:
-        temporary.unlink(missing_ok=True)  # what a killed worker left; one that only seemed so has it still
         samples = written(found, temporary, final.name)
+        synchronise_file(temporary)
     except OSError as e:
         temporary.unlink(missing_ok=True)
         kind = DiskError if is_of_the_disk(e) else InputError
@@ -413,9 +417,10 @@ _WORK: Final[Mapping[str, Callable[[Task, argparse.Namespace, td.files.AnyPath],
 
 def batch_command(a: argparse.Namespace) -> int:
     task = _task(a)
-    found = [of for of in sources_of(a.recordings, ENDINGS, without=own_files(a)) if not _is_output(of, task)]
+    found = sources_of(a.recordings, ENDINGS, without=own_files(a), absolute=a.scheduler is not None)
+    found = _without_outputs(found, task, a.recordings)
     if task.calibration is None and getattr(a, "calibration", None) == BESIDE:
-        found = [_with_calibration(of) if isinstance(of, Source) else of for of in found]
+        found = with_files_beside(found, _calibrations_beside)
     if task.command == "apply":
         _require_apart(found, task)
     counts: Counter[str] = Counter()
@@ -432,6 +437,8 @@ def batch_command(a: argparse.Namespace) -> int:
         partial(_is_whole, task), partial(_refusal, task),
     )  # fmt: skip
     code = run_job(job, a)
+    if task.command == "apply":
+        _remove_parts(found, task)
     show(f"{tc.number_format.number_of(len(found), 'recording')}{_told(counts)}")
     return code
 
@@ -473,24 +480,36 @@ def _said(task: Task) -> str:
     return said_options({**plain, **digests, "calibration": calibration, "to": task.to, "ending": task.ending})
 
 
-def _with_calibration(of: Source) -> Source:
-    """A recording counts as changed, too, where the calibration beside it has. That of
-    a store would take a request for each."""
-    if is_url(of.name):
-        return of
-    for ending in BESIDE_ENDINGS:
-        path = Path(of.name)
-        try:
-            status = path.with_name(stem_of(path.name) + ending).stat()
-        except OSError:
-            continue
-        return Source(of.name, of.size, f"{of.stamp}+{status.st_mtime_ns}")
-    return of
+def _calibrations_beside(path: td.files.AnyPath) -> list[td.files.AnyPath]:
+    """Files that `Calibration.beside` looks for."""
+    return [path.with_name(stem_of(path.name) + ending) for ending in BESIDE_ENDINGS]
 
 
-def _is_output(of: Found, task: Task) -> bool:
-    """Whether it lies in the folder that the work writes to."""
-    return task.to is not None and not is_url(of.name) and Path(of.name).absolute().parent == Path(task.to)
+def _without_outputs(found: Sequence[Found], task: Task, asked: Sequence[str]) -> list[Found]:
+    """Files in the folder that the work writes to are no recordings, where that folder
+    lies below one that was asked for. Raises InputError for any other recording in
+    it."""
+    if task.to is None:
+        return list(found)
+    to = Path(task.to)
+    below = any(Path(given).absolute() in to.parents for given in asked if not is_url(given))
+    left = []
+    for of in found:
+        if is_url(of.name) or isinstance(of, Unusable) or Path(of.name).absolute().parent != to:
+            left.append(of)
+        elif not below or of.name in asked:
+            raise InputError(f"{of.name}: lies in --to {to}; write to another folder")
+    return left
+
+
+def _remove_parts(found: Sequence[Found], task: Task) -> None:
+    """What workers that were killed have left of the files of these recordings."""
+    names = {task.final(of.name).name for of in found if isinstance(of, Source)}
+    with suppress(OSError), os.scandir(str(task.to)) as entries:
+        for entry in entries:
+            if (match := _PART.fullmatch(entry.name)) and match[1] in names:
+                with suppress(OSError):
+                    os.unlink(entry.path)
 
 
 def _require_apart(found: Sequence[Found], task: Task) -> None:

@@ -8,18 +8,19 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import triaxcal_drivers as td
 from triaxcald.abort import AbortNotice, at_abort
 from triaxcald.cli.console import at, emit, erased, say, show
-from triaxcald.errors import BAD_INPUT, InputError, severest
+from triaxcald.errors import BAD_INPUT, DaemonError, InputError, exit_code_of, severest
+from triaxcald.files import synchronise
 from triaxcald.many import (
     Column,
     Done,
@@ -33,11 +34,15 @@ from triaxcald.many import (
     Work,
     attempt,
     is_current,
+    limits,
     open_table,
     sources_of,
     unusable,
 )
 from triaxcald.stores import is_url
+
+if TYPE_CHECKING:
+    from triaxcald.audit import ChainAudit, Policy
 
 FEW = 8
 """Fewer recordings than these are worked at here, unless processes are asked for:
@@ -45,6 +50,9 @@ starting two takes as long as two audits."""
 MEMORY = 300 * 2**20
 """Bytes of a worker. numpy, scipy, matplotlib and dask take 170 MB of it, an audit of a
 run of 30 poses some 60."""
+MEMORY_LEAST = 200 * 2**20
+"""Less than the 170 MB that a worker has before its first recording leaves room for
+none: the worker would die at each."""
 WAITING_S = 30.0
 """Without any worker for so long, that is said."""
 
@@ -69,8 +77,13 @@ class Job:
 
 
 def run_job(job: Job, a: argparse.Namespace) -> int:
-    """The worst exit code of all. Raises InputError, DiskError, StationError."""
+    """The worst exit code of all. Raises InputError, also where there is no recording,
+    DiskError, StationError."""
+    if not job.found:
+        raise InputError(f"{', '.join(a.recordings)}: no recording is left to work at")
     processes = _processes(a, len(job.found))
+    if processes is not None and a.memory is not None and a.memory < MEMORY_LEAST:
+        raise InputError(f"--memory: a process needs at least {MEMORY_LEAST // 2**20}M; give more, or take --jobs 1")
     settings = Settings(
         sha256(f"{job.command}\n{job.options}".encode()).hexdigest()[:16],
         memory=a.memory if processes is None else a.memory or MEMORY,
@@ -84,7 +97,7 @@ def run_job(job: Job, a: argparse.Namespace) -> int:
             codes.add(done.exit_code)
             job.each(done)
             sys.stdout.flush()  # a signal that ends the work leaves no line in the buffer
-        table.finish(of.name for of in job.found)
+        table.finish((of.name for of in job.found), a.recordings)
     return severest(codes)
 
 
@@ -107,7 +120,9 @@ def _processes(a: argparse.Namespace, count: int) -> int | None:
 
         require_dask()
         return int(a.jobs)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = limits.processors()
+    if (most := limits.memory()) is not None:
+        cores = min(cores, max(1, most // (a.memory or MEMORY)))
     if count < FEW or cores == 1 or td.hints.absent(("distributed",)):
         return None
     return min(cores, count)
@@ -121,17 +136,24 @@ class _Engine:
         self._job, self._settings, self._table = job, settings, table
         self._pace = Pace(len(job.found), time.monotonic())
 
-    def _known(self, of: Found) -> Done | None:
-        """None where there is work to do."""
+    def _plan(self, of: Found) -> Done | str | None:
+        """The stored result that holds, or why there is no work to do; None where there
+        is."""
         if isinstance(of, Unusable):
-            return self._stored(unusable(of, of.error, of.exit_code, self._settings))
+            return of.error
         row = self._table.stored(of.name)
         if row is not None and is_current(row, of, self._settings) and self._job.is_whole(row):
-            self._pace.skip(1)
             return Done(of.name, row)
-        if (why := self._job.refusal(of, row)) is not None:
-            return self._stored(unusable(of, why, BAD_INPUT, self._settings))
-        return None
+        return self._job.refusal(of, row)
+
+    def _without_work(self, of: Found) -> Done | None:
+        plan = self._plan(of)
+        if isinstance(plan, str):
+            code = of.exit_code if isinstance(of, Unusable) else BAD_INPUT
+            return self._stored(unusable(of, plan, code, self._settings))
+        if plan is not None:
+            self._pace.skip(1)
+        return plan
 
     def _stored(self, done: Done) -> Done:
         before = self._table.stored(done.name) if done.written else None
@@ -151,7 +173,7 @@ class _Here(_Engine):
 
     def through(self) -> Iterator[Done]:
         for of in self._job.found:
-            known = self._known(of)
+            known = self._without_work(of)
             if known is not None:
                 yield known
             elif isinstance(of, Source):
@@ -169,25 +191,27 @@ class _Elsewhere(_Engine):
         self._last_worker_s = time.monotonic()
 
     def through(self) -> Iterator[Done]:
-        left = []
-        for of in self._job.found:
-            if (known := self._known(of)) is not None:
-                yield known
-            elif isinstance(of, Source):
-                left.append(of)
+        left = [of for of in self._job.found if isinstance(of, Source) and self._plan(of) is None]
         if not left:
+            yield from self._others(set())
             return
         from triaxcald.many.cluster import cluster_at, local_cluster, results
 
         self._tell()
-        with (
+        with (  # before anything is stored: where none answers, the table stays as it is
             local_cluster(min(self._processes, len(left)), self._settings.memory)
             if self._address is None
             else cluster_at(self._address) as cluster
         ):
+            yield from self._others({of.name for of in left})
             for done in results(cluster, self._job.work, left, self._settings, self._waits):
                 yield self._stored(done)
                 self._tell()
+
+    def _others(self, left: set[str]) -> Iterator[Done]:
+        for of in self._job.found:
+            if of.name not in left and (done := self._without_work(of)) is not None:
+                yield done
 
     def _waits(self, workers: int) -> None:
         now = time.monotonic()
@@ -209,17 +233,35 @@ def published(done: Done, table: Table, before: Row | None) -> Done:
         if before is not None and before.get("output") == str(final):
             os.replace(temporary, final)
         else:
-            os.link(temporary, final)
-            temporary.unlink()
+            _take_name(temporary, final)
+        synchronise(final.parent)
         return done
     except FileExistsError:
-        temporary.unlink(missing_ok=True)
         error = f"{final}: exists already"
     except OSError as e:
         error = f"{final}: cannot be written: {e.strerror}"
+    with suppress(OSError):
+        temporary.unlink(missing_ok=True)
     row = {**done.row, "error": error, "exit_code": BAD_INPUT}
     table.store(row)
     return Done(done.name, row)
+
+
+def _take_name(temporary: Path, final: Path) -> None:
+    """Raises FileExistsError where the name is taken, and other OSError."""
+    try:
+        os.link(temporary, final)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        os.close(os.open(final, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        try:
+            os.replace(temporary, final)
+        except BaseException:
+            final.unlink(missing_ok=True)
+            raise
+    else:
+        temporary.unlink()
 
 
 def own_files(a: argparse.Namespace) -> list[Path]:
@@ -236,16 +278,18 @@ def said_options(options: dict[str, Any]) -> str:
 
 
 def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import Policy, audit_chain, many, text  # the whole line, which no other command needs
+    from triaxcald.audit import Policy, many, text  # the whole line, which no other command needs
 
     _require_agreeing(a)
-    policy = Policy(a.trust, a.allow_unsigned)
-    chains = [audit_chain(folder, policy, a.head) for folder in _chains(a)]
-    found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS)
+    elsewhere = a.scheduler is not None  # workers start from another folder
+    trust = a.trust.absolute() if elsewhere and a.trust is not None else a.trust
+    policy = Policy(trust, a.allow_unsigned)
+    chains, broken = _audited_chains(a, policy)
+    found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS, absolute=elsewhere)
     if a.as_made:
-        return _audit_as_made(a, found)
-    if a.resume and a.output is None:
-        raise InputError("--resume: give the table that is to be finished: -o TABLE")
+        return _audit_as_made(a, found, policy)
+    if a.output is not None:
+        found = many.with_files_beside(found)
     counts: Counter[str] = Counter()
     documents: dict[str, dict[str, Any]] = {}
 
@@ -274,14 +318,31 @@ def audit_command(a: argparse.Namespace) -> int:
     code = run_job(job, a)
     if a.json:
         audits = [documents[of.name] for of in found]
-        told = {"chains": [text.chain_document(of) for of in chains]} if a.chain else {}
+        entries = [*map(text.chain_document, chains), *(text.chain_error(of.name, of.error) for of in broken)]
+        told = {"chains": entries} if a.chain else {}
         emit({"format": "triaxcal.audit/1", "audits": audits, "summary": text.counts(counts), **told})
     else:
         if len(found) > 1 or a.output is not None:
             show(text.summary(counts))
         for line in chain(*map(text.chained, chains)):
             show(line)
-    return severest([code, *(of.exit_code for of in chains)])
+    for failed in broken:
+        say(f"triaxcal: {failed.error}")
+    return severest([code, *(of.exit_code for of in chains), *(of.exit_code for of in broken)])
+
+
+def _audited_chains(a: argparse.Namespace, policy: Policy) -> tuple[list[ChainAudit], list[Unusable]]:
+    """And the folders whose chains cannot be audited, which hide no others. Raises
+    InputError for options that do not go together."""
+    from triaxcald.audit import audit_chain
+
+    chains, broken = [], []
+    for folder in _chains(a):
+        try:
+            chains.append(audit_chain(folder, policy, a.head))
+        except (DaemonError, td.ProfileError) as e:
+            broken.append(Unusable(str(folder), str(e), exit_code_of(e)))
+    return chains, broken
 
 
 def _chains(a: argparse.Namespace) -> list[Path]:
@@ -302,11 +363,14 @@ def _chains(a: argparse.Namespace) -> list[Path]:
     return found
 
 
-def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
-    """Under the versions that made the recordings, one environment after the other."""
+def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found], policy: Policy) -> int:
+    """Under the versions that made the recordings, one environment after the other.
+    Signatures are checked here, since earlier versions know no trust file."""
     from triaxcald.audit import as_made
     from triaxcald.audit.wheels import Wheels
 
+    if not asked:
+        raise InputError(f"{', '.join(a.recordings)}: no recording is left to audit")
     wheels = Wheels.of(a.wheels)
     found, failed = as_made.grouped([Path(one.name) for one in asked if isinstance(one, Source)])
     failed = [*(one for one in asked if isinstance(one, Unusable)), *failed]
@@ -314,7 +378,9 @@ def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
         say(f"triaxcal: {one.error}")
     parts: list[as_made.Part] = []
     for software, recordings in found.items():
-        for part in as_made.audit_as_made(software, recordings, wheels, as_json=a.json, begins=_at, notes=say):
+        for part in as_made.audit_as_made(
+            software, recordings, wheels, as_json=a.json, policy=policy, begins=_at, notes=say
+        ):
             parts.append(part)
             if part.error is not None:
                 say(f"triaxcal: {part.error}")
@@ -322,7 +388,11 @@ def _audit_as_made(a: argparse.Namespace, asked: Sequence[Found]) -> int:
         sys.stdout.write(parts[0].output.decode(errors="replace"))
     elif a.json:
         emit(as_made.document_of(parts, failed, [one.name for one in asked]))
-    return as_made.worst_of([part.exit_code for part in parts] + [one.exit_code for one in failed])
+    unproven = as_made.unproven([path for recordings in found.values() for path in recordings], policy)
+    for one in unproven:
+        say(f"triaxcal: {one.error}")
+    codes = [part.exit_code for part in parts] + [one.exit_code for one in (*failed, *unproven)]
+    return as_made.worst_of(codes)
 
 
 def _at(what: str) -> None:

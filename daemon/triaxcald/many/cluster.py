@@ -271,4 +271,10 @@ class _Run:
             raise InputError(
                 f"{self._cluster.where}: a worker cannot load triaxcal: {error}; install this version there"
             ) from error
+        if isinstance(error, RuntimeError) and "deserialization" in str(
+            error
+        ):  # dask's words for what it cannot import
+            raise InputError(
+                f"{self._cluster.where}: the scheduler cannot load triaxcal; install this version there, too"
+            ) from error
         raise StationError(f"{self._cluster.where}: {source.name}: {type(error).__name__}: {error}") from error

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import triaxcal_drivers as td
-from triaxcald.errors import DISK, DaemonError, InputError, exit_code_of
+from triaxcald.errors import BAD_INPUT, DISK, DaemonError, InputError, exit_code_of
 from triaxcald.files import is_of_the_disk
 from triaxcald.stores import Listed, StoreFile, files_like, files_under, is_url, path_of
 
@@ -47,24 +48,31 @@ Found = Source | Unusable
 
 
 def sources_of(
-    asked: Sequence[str], endings: tuple[str, ...], *, without: Iterable[Path] = (), lists: tuple[str, ...] = LIST
+    asked: Sequence[str],
+    endings: tuple[str, ...],
+    *,
+    without: Iterable[Path] = (),
+    lists: tuple[str, ...] = LIST,
+    absolute: bool = False,
 ) -> list[Found]:
     """Recordings, folders of recordings, patterns, lists and URLs, in the order in
     which they are given, each recording once. What names no recording is its own error.
     ``endings`` are those of recordings in a folder, ``lists`` those of manifests; the
-    files ``without`` are none."""
+    files ``without`` are none. Paths are ``absolute`` for who has another folder to
+    start from."""
     own = {path.absolute() for path in without}
     found: dict[str, Found] = {}
     for given in asked:
         try:
             for source in _sources_of(given, endings, lists):
+                if absolute and isinstance(source, Source) and not is_url(source.name):
+                    source = replace(source, name=str(Path(source.name).absolute()))
                 if not own or is_url(source.name) or Path(source.name).absolute() not in own:
                     found.setdefault(source.name, source)
         except DaemonError as e:
             found[given] = Unusable(given, str(e), exit_code_of(e))
         except OSError as e:
-            code = DISK if is_of_the_disk(e) else 2
-            found[given] = Unusable(given, f"{given}: {e.strerror or e}", code)
+            found[given] = _unusable(given, e)
     return list(found.values())
 
 
@@ -77,6 +85,10 @@ def _sources_of(given: str, endings: tuple[str, ...], lists: tuple[str, ...]) ->
     if is_url(given) and not given.startswith("file://"):
         return _in_store(given, endings)
     return _in_folder(path_of(given), endings)
+
+
+def _unusable(name: str, e: OSError, why: str = "") -> Unusable:
+    return Unusable(name, f"{name}: {why}{e.strerror or e}", DISK if is_of_the_disk(e) else 2)
 
 
 def _is_folder(given: str) -> bool:
@@ -103,7 +115,9 @@ def _one(name: str, file: StoreFile) -> Found:
     try:
         return _stored(file.listed())
     except OSError as e:
-        return Unusable(name, f"{name}: cannot be read: {e.strerror or e}", DISK if is_of_the_disk(e) else 2)
+        return _unusable(name, e, "cannot be read: ")
+    except DaemonError as e:
+        return Unusable(name, str(e), exit_code_of(e))
 
 
 def _stored(of: Listed) -> Source:
@@ -113,18 +127,30 @@ def _stored(of: Listed) -> Source:
 def _in_folder(given: td.files.AnyPath, endings: tuple[str, ...]) -> list[Found]:
     assert isinstance(given, Path)
     if given.is_dir():
-        paths = sorted(path for path in given.rglob("*") if path.name.endswith(endings) and not path.is_dir())
-        if MANIFEST in endings:
-            paths = _without_segments(paths)
-        if not paths:
+        paths, unusable = _below(given, endings)
+        if not paths and not unusable:
             raise InputError(f"{given}: Is a directory, without a recording ({', '.join(endings)}) in it")
-        return [_local(path) for path in paths]
+        return [*map(_local, paths), *unusable]
     if not given.exists() and _WILD & set(str(given)):
         matches = sorted(map(Path, glob.glob(str(given), recursive=True)))
         if not matches:
             raise InputError(f"{given}: no file has a name like this")
         return [s for of in matches for s in (_in_folder(of, endings) if of.is_dir() else [_local(of)])]
     return [_local(given)]
+
+
+def _below(folder: Path, endings: tuple[str, ...]) -> tuple[list[Path], list[Unusable]]:
+    """Recordings in order, and folders that cannot be looked into."""
+    errors: list[OSError] = []
+    paths = sorted(
+        Path(within, name)
+        for within, _, names in os.walk(folder, onerror=errors.append)
+        for name in names
+        if name.endswith(endings)
+    )
+    if MANIFEST in endings:
+        paths = _without_segments(paths)
+    return paths, [_unusable(str(e.filename), e, "cannot be looked into: ") for e in errors]
 
 
 def _without_segments(paths: list[Path]) -> list[Path]:
@@ -155,17 +181,25 @@ def _of_list(name: str) -> Iterator[Found]:
         entry = line.strip()
         if not entry or entry.startswith("#"):
             continue
-        if len(entry) > LINE_MOST or "\0" in entry:
-            raise InputError(f"{name}, line {number}: expected a path or URL of at most {LINE_MOST} characters")
         count += 1
-        if is_url(entry) and not entry.startswith("file://"):
+        if len(entry) > LINE_MOST or "\0" in entry:
+            at = f"{name}, line {number}"
+            yield Unusable(at, f"{at}: expected a path or URL of at most {LINE_MOST} characters", BAD_INPUT)
+        elif is_url(entry) and not entry.startswith("file://"):
             yield _one(entry, StoreFile(entry))
         elif isinstance(where, Path):
-            path = path_of(entry)
-            assert isinstance(path, Path)
-            yield _local(where.parent / path)
+            yield _of_line(entry, where.parent)
         else:
             url = f"{where.parent}/{entry}"
             yield _one(url, StoreFile(url))
     if not count:
         raise InputError(f"{name}: no recording is in this list")
+
+
+def _of_line(entry: str, folder: Path) -> Found:
+    try:
+        path = path_of(entry)
+    except DaemonError as e:
+        return Unusable(entry, str(e), exit_code_of(e))
+    assert isinstance(path, Path)
+    return _local(folder / path)

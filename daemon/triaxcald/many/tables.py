@@ -9,6 +9,7 @@ import io
 import json
 import os
 import sqlite3
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,14 +18,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from triaxcald.errors import DEVICE, DISK, DeviceInUse, DiskError, InputError
-from triaxcald.files import new_beside, require_writable
+from triaxcald.files import new_beside, require_writable, synchronise
 from triaxcald.many.sources import Source
-from triaxcald.many.work import Column, Row, Settings
+from triaxcald.many.work import COMMON_AFTER, COMMON_BEFORE, Column, Row, Settings
 from triaxcald.schema.columns import Kind
 
 TABLE_KINDS: Final = (".parquet", ".csv", ".csv.gz", ".sqlite")
 FORMAT: Final = "triaxcal.many/1"
 JOURNAL: Final = ".journal"
+LOCK: Final = ".lock"
 _AGAIN: Final = frozenset((DEVICE, DISK))
 """Exit codes of what may come out otherwise another time: a worker that died, memory,
 a store or disk that failed."""
@@ -56,8 +58,10 @@ def is_current(row: Row, of: Source, settings: Settings) -> bool:
     software and settings, and would not come out otherwise another time."""
     if row["exit_code"] in _AGAIN or not (of.stamp or of.size):
         return False
+    if row["error"] and not row["sha256"]:  # never read: for lack of a right, a mount or a package
+        return False
     now = (of.size, of.stamp, settings.software, settings.digest)
-    return now == (row["size"], row["stamp"], row["software"], row["settings"])
+    return now == (row["size"], row["stamp"] or "", row["software"], row["settings"])
 
 
 class Table(ABC):
@@ -75,9 +79,10 @@ class Table(ABC):
         """Raises DiskError."""
 
     @abstractmethod
-    def finish(self, order: Iterable[str]) -> None:
-        """All is done; rows are to be in this order where the table has one. Raises
-        DiskError."""
+    def finish(self, order: Iterable[str], asked: Sequence[str] = ()) -> None:
+        """All is done; rows are to be in this order where the table has one. Rows of
+        what was ``asked`` for, or lies below it, go if they name no recording and are
+        not in the ``order``: the argument has been mended. Raises DiskError."""
 
     @abstractmethod
     def close(self) -> None: ...
@@ -100,6 +105,14 @@ def _plain(cell: Any) -> Any:
     return None if isinstance(cell, float) and not isfinite(cell) else cell
 
 
+def _names_none(row: Mapping[str, Any], asked: Sequence[str]) -> bool:
+    """Whether the row is an error of an argument, or of a part of one."""
+    if not row["error"] or row["sha256"] or row["size"] is not None or row["stamp"]:
+        return False
+    name = str(row["recording"])
+    return any(name == given or name.startswith(f"{given.rstrip('/')}/") for given in asked)
+
+
 class _Nowhere(Table):
     def stored(self, name: str) -> Row | None:
         return None
@@ -107,7 +120,7 @@ class _Nowhere(Table):
     def store(self, row: Row) -> None:
         pass
 
-    def finish(self, order: Iterable[str]) -> None:
+    def finish(self, order: Iterable[str], asked: Sequence[str] = ()) -> None:
         pass
 
     def close(self) -> None:
@@ -123,31 +136,52 @@ class FileTable(Table):
         self._path = path
         self._journal_path = path.with_name(path.name + JOURNAL)
         self._head = {"format": FORMAT, "command": command}
+        self._is_new = self._has_more = False
         require_writable(self._journal_path)
-        if self._journal_path.exists() and not resume:
+        self._lock = _Lock(path)
+        try:
+            self._journal, self._offsets = self._opened(resume)
+        except BaseException as e:
+            self._lock.release()
+            if isinstance(e, OSError):
+                raise InputError(f"{self._journal_path}: cannot be written: {e.strerror}") from e
+            raise
+
+    def _opened(self, resume: bool) -> tuple[BinaryIO, dict[str, int]]:
+        """The journal, and where each recording's latest row begins. Raises InputError,
+        OSError."""
+        if not self._journal_path.exists():
+            return self._begun(resume)
+        if not resume:
             raise InputError(
                 f"{self._journal_path}: an interrupted run has left it; --resume goes on with it, or delete it"
             )
+        file = open(self._journal_path, "r+b")  # noqa: SIM115 - until `close`
         try:
-            self._journal: BinaryIO = open(self._journal_path, "a+b")  # noqa: SIM115 - until `close`
-            _lock(self._journal, path)
-            self._offsets = self._read_journal(resume)
-        except OSError as e:
-            raise InputError(f"{self._journal_path}: cannot be written: {e.strerror}") from e
+            head = file.readline()
+            if not head.endswith(b"\n") and _line(self._head).startswith(head):  # nothing came of it
+                file.close()
+                return self._begun(resume)
+            return file, self._read_journal(file, head)
+        except BaseException:
+            file.close()
+            raise
 
-    def _read_journal(self, resume: bool) -> dict[str, int]:
-        """Where each recording's latest row begins. Raises InputError, OSError."""
-        file, offsets = self._journal, dict[str, int]()
-        file.seek(0)
-        head = file.readline()
-        if not head.endswith(b"\n"):  # a new one, or nothing came of it
-            file.truncate(0)
-            self._append(self._head)
-            if resume and self._path.exists():
-                for row in self._rows_of_table():
-                    offsets[str(row["recording"])] = self._append(row, durable=False)
-            return offsets
-        said = _object(head)
+    def _begun(self, resume: bool) -> tuple[BinaryIO, dict[str, int]]:
+        """A new journal, with the rows of the finished table on ``resume``. It is on
+        the disk as a whole or not at all."""
+        kept = self._rows_of_table(resume)
+        offsets = dict[str, int]()
+        with new_beside(self._journal_path) as beside, beside.open("wb") as file:
+            file.write(_line(self._head))
+            for row in kept:
+                offsets[str(row["recording"])] = file.tell()
+                file.write(_line(row))
+        self._is_new = True
+        return open(self._journal_path, "r+b"), offsets
+
+    def _read_journal(self, file: BinaryIO, head: bytes) -> dict[str, int]:
+        said, offsets = _object(head), dict[str, int]()
         if said != self._head:
             ours, theirs = (f"`triaxcal {h.get('command')}`" for h in (self._head, said or {}))
             raise InputError(f"{self._journal_path}: the journal of {theirs}, expected that of {ours}")
@@ -161,26 +195,34 @@ class FileTable(Table):
             at = file.tell()
         return offsets
 
-    def _rows_of_table(self) -> Iterator[Row]:
-        """Of a finished table. Raises InputError where it has other columns."""
-        names = [column.name for column in self.columns]
+    def _rows_of_table(self, resume: bool) -> Iterator[Row]:
+        """Of a finished table, none without ``resume``. Raises InputError where the
+        file is no table of results, or on ``resume`` one without all the columns."""
+        if not self._path.exists() or not self._path.stat().st_size:
+            return iter(())
         if self._path.name.endswith(".parquet"):
             from triaxcald.tables.arrow import read_rows
 
             held, rows = read_rows(self._path)
         else:
             held, rows = _read_csv(self._path, {c.name: _TYPES[c.kind] for c in self.columns})
-        if missing := set(names) - set(held):
-            raise InputError(f"{self._path}: no table of `triaxcal {self._head['command']}`: no column {min(missing)}")
-        for row in rows:
-            yield {name: row.get(name) for name in names}
+        needed = [column.name for column in (self.columns if resume else (*COMMON_BEFORE, *COMMON_AFTER))]
+        if missing := set(needed) - set(held):
+            of = (
+                f"table of `triaxcal {self._head['command']}`"
+                if resume
+                else "table of results, which alone is replaced"
+            )
+            raise InputError(f"{self._path}: no {of}: no column {min(missing)}")
+        if not resume:
+            return iter(())
+        return ({name: row.get(name) for name in needed} for row in rows)
 
-    def _append(self, value: Mapping[str, Any], *, durable: bool = True) -> int:
+    def _append(self, value: Mapping[str, Any]) -> int:
         at = self._journal.seek(0, os.SEEK_END)
-        self._journal.write(json.dumps(value, ensure_ascii=False, allow_nan=False).encode() + b"\n")
-        if durable:
-            self._journal.flush()
-            os.fsync(self._journal.fileno())
+        self._journal.write(_line(value))
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
         return at
 
     def stored(self, name: str) -> Row | None:
@@ -195,17 +237,20 @@ class FileTable(Table):
         try:
             cells = dict(zip((column.name for column in self.columns), self._cells(row), strict=True))
             self._offsets[cells["recording"]] = self._append(cells)
+            self._has_more = True
         except OSError as e:
             raise DiskError(f"{self._journal_path}: cannot be written: {e.strerror}; --resume goes on") from e
 
-    def finish(self, order: Iterable[str]) -> None:
-        asked = (_plain(name) for name in order)
-        names = dict.fromkeys([*(n for n in asked if n in self._offsets), *self._offsets])
-        rows = (self._cells(row) for name in names if (row := self.stored(name)) is not None)
+    def finish(self, order: Iterable[str], asked: Sequence[str] = ()) -> None:
+        given = dict.fromkeys(_plain(name) for name in order)
+        names = dict.fromkeys([*(n for n in given if n in self._offsets), *self._offsets])
+        found = (row for name in names if (row := self.stored(name)) is not None)
+        rows = (self._cells(row) for row in found if row["recording"] in given or not _names_none(row, asked))
         try:
             with new_beside(self._path) as beside:
                 self._write(beside, rows)
             self._journal_path.unlink()
+            synchronise(self._path.parent)
         except OSError as e:
             raise DiskError(f"{self._path}: cannot be written: {e.strerror}; --resume goes on") from e
 
@@ -221,11 +266,16 @@ class FileTable(Table):
             with io.TextIOWrapper(packed, "utf-8", newline="") as out:
                 lines = csv.writer(out, lineterminator="\n")
                 lines.writerow(types)
-                lines.writerows(rows)
+                quoted = csv.writer(out, lineterminator="\n", quoting=csv.QUOTE_ALL)
+                for row in rows:  # the module quotes no carriage return, at which it ends a line
+                    (quoted if any(isinstance(cell, str) and "\r" in cell for cell in row) else lines).writerow(row)
 
     def close(self) -> None:
         with suppress(OSError):
             self._journal.close()
+            if self._is_new and not self._has_more:  # nothing came of it, and the table has all that it holds
+                self._journal_path.unlink(missing_ok=True)
+        self._lock.release()
 
 
 def _packed(path: Path) -> bool:
@@ -234,24 +284,35 @@ def _packed(path: Path) -> bool:
 
 def _read_csv(path: Path, types: Mapping[str, type]) -> tuple[list[str], Iterator[Row]]:
     """Raises InputError."""
-    try:
-        raw: Any = gzip.open(path, "rb") if _packed(path) else path.open("rb")  # noqa: SIM115 - until all rows are read
-        text = io.TextIOWrapper(raw, "utf-8", newline="")
-        lines = csv.reader(text)
-        names = next(lines, [])
-    except (OSError, ValueError, csv.Error) as e:
-        raise InputError(f"{path}: cannot be read as a table of results: {e}") from e
+
+    def opened() -> io.TextIOWrapper:
+        raw: Any = gzip.open(path, "rb") if _packed(path) else path.open("rb")  # noqa: SIM115 - closed with the text
+        return io.TextIOWrapper(raw, "utf-8", newline="")
 
     def rows() -> Iterator[Row]:
-        with text:
-            try:
+        try:
+            with opened() as text:
+                lines = csv.reader(text)
+                next(lines, None)
                 for line in lines:
                     row = dict(zip(names, line, strict=True))
                     yield {name: types[name](cell) if cell else None for name, cell in row.items() if name in types}
-            except (OSError, ValueError, csv.Error) as e:
-                raise InputError(f"{path}: cannot be read as a table of results: {e}") from e
+        except _UNREADABLE as e:
+            raise InputError(f"{path}: cannot be read as a table of results: {e}") from e
 
+    try:
+        with opened() as text:
+            names = next(csv.reader(text), [])
+    except _UNREADABLE as e:
+        raise InputError(f"{path}: cannot be read as a table of results: {e}") from e
     return names, rows()
+
+
+_UNREADABLE: Final = (OSError, ValueError, EOFError, zlib.error, csv.Error)
+
+
+def _line(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode() + b"\n"
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
@@ -269,78 +330,154 @@ class SqliteTable(Table):
     def __init__(self, path: Path, command: str, columns: Sequence[Column[Any]], *, resume: bool) -> None:
         super().__init__(columns)
         self._path, self._command = path, command
-        self._held: BinaryIO | None = None
+        self._was_there = path.exists()
+        self._begun = False
+        listed = ", ".join("?" * len(columns))
+        self._put = f"INSERT OR REPLACE INTO recordings VALUES ({listed})"
+        self._lock = _Lock(path)
+        self._db: sqlite3.Connection | None = None
         try:
             self._db = sqlite3.connect(path, isolation_level=None)
-            self._held = open(path, "rb")  # noqa: SIM115 - closed after the connection: closing drops its locks
-            _lock(self._held, path)
-            self._db.execute("PRAGMA journal_mode = TRUNCATE")  # a row takes half the time
-            self._begin(resume)
-        except (sqlite3.Error, OSError) as e:
-            raise InputError(f"{path}: cannot be used as a table of results: {_reason(e)}") from e
+            self._goes_on = self._require_ours(resume)
+        except BaseException as e:
+            self.close()
+            if isinstance(e, sqlite3.Error | OSError):
+                raise InputError(f"{path}: cannot be used as a table of results: {_reason(e)}") from e
+            raise
 
-    def _begin(self, resume: bool) -> None:
-        """Raises InputError, sqlite3.Error."""
+    def _require_ours(self, resume: bool) -> bool:
+        """Whether there are rows to go on with. Raises InputError, sqlite3.Error;
+        changes nothing."""
+        assert self._db is not None
         tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if tables and not {"made", "recordings"} <= tables:
+        if not tables:
+            return False
+        if not {"made", "recordings"} <= tables:
             raise InputError(f"{self._path}: a database with other tables ({min(tables)}); write to another file")
-        made = dict(self._db.execute("SELECT key, value FROM made")) if tables else {}
-        if tables and made.get("format") != FORMAT:
+        made = dict(self._db.execute("SELECT key, value FROM made"))
+        if made.get("format") != FORMAT:
             raise InputError(f"{self._path}: a database of another kind; write to another file")
-        if tables and not resume and made.get("state") != "done":
+        if not resume and made.get("state") != "done":
             raise InputError(f"{self._path}: an interrupted run has left it; --resume goes on with it, or delete it")
-        if tables and resume and made.get("command") != self._command:
+        if not resume:
+            return False
+        if made.get("command") != self._command:
             ours, theirs = f"`triaxcal {self._command}`", f"`triaxcal {made.get('command')}`"
             raise InputError(f"{self._path}: the table of {theirs}, expected that of {ours}")
         there = [name for _, name, *_ in self._db.execute("PRAGMA table_info(recordings)")]
-        names = [column.name for column in self.columns]
+        if there != [column.name for column in self.columns]:
+            raise InputError(f"{self._path}: no table of `triaxcal {self._command}` of this version: other columns")
+        return True
+
+    def _begin(self) -> None:
+        """With the first row: a start that fails leaves the finished table. Raises
+        sqlite3.Error."""
+        assert self._db is not None
+        self._begun = True
+        self._db.execute("PRAGMA journal_mode = TRUNCATE")  # a row takes half the time
         self._db.execute("BEGIN IMMEDIATE")
-        if not resume or there != names:  # columns of another version: every row is made again
+        if not self._goes_on:
             self._db.execute("DROP TABLE IF EXISTS recordings")
             listed = ", ".join(f'"{c.name}" {_SQL[c.kind]}' for c in self.columns)
             self._db.execute(f"CREATE TABLE recordings ({listed}, PRIMARY KEY (recording))")
         self._db.execute("CREATE TABLE IF NOT EXISTS made (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
         said = {"format": FORMAT, "command": self._command, "state": "running"}
         self._db.executemany("INSERT OR REPLACE INTO made VALUES (?, ?)", said.items())
-        self._db.execute("COMMIT")
-        self._put = f"INSERT OR REPLACE INTO recordings VALUES ({', '.join('?' * len(names))})"
 
     def stored(self, name: str) -> Row | None:
+        if self._db is None or not (self._goes_on or self._begun):
+            return None
         cells = self._db.execute("SELECT * FROM recordings WHERE recording = ?", (_plain(name),)).fetchone()
         return None if cells is None else dict(zip((c.name for c in self.columns), cells, strict=True))
 
     def store(self, row: Row) -> None:
-        self._execute(self._put, self._cells(row))
+        self._execute((self._put, self._cells(row)))
 
-    def finish(self, order: Iterable[str]) -> None:
-        self._execute("UPDATE made SET value = 'done' WHERE key = 'state'", ())
+    def finish(self, order: Iterable[str], asked: Sequence[str] = ()) -> None:
+        self._execute(*((_DELETE, (name,)) for name in self._mended(order, asked)), (_FINISH, ()))
 
-    def _execute(self, statement: str, values: Sequence[Any]) -> None:
+    def _mended(self, order: Iterable[str], asked: Sequence[str]) -> list[str]:
+        if self._db is None or not (self._goes_on or self._begun):
+            return []
         try:
-            self._db.execute(statement, values)
+            cursor = self._db.execute("SELECT * FROM recordings WHERE error IS NOT NULL AND sha256 IS NULL")
+            names = [column.name for column in self.columns]
+            rows = [dict(zip(names, cells, strict=True)) for cells in cursor]
         except sqlite3.Error as e:
+            raise DiskError(f"{self._path}: cannot be read: {_reason(e)}; --resume goes on") from e
+        given = {_plain(name) for name in order} if rows else set()
+        return [row["recording"] for row in rows if row["recording"] not in given and _names_none(row, asked)]
+
+    def _execute(self, *statements: tuple[str, Sequence[Any]]) -> None:
+        """As one transaction. Raises DiskError."""
+        assert self._db is not None
+        try:
+            if self._begun:
+                self._db.execute("BEGIN IMMEDIATE")
+            else:
+                self._begin()
+            for statement, values in statements:
+                self._db.execute(statement, values)
+            self._db.execute("COMMIT")
+        except sqlite3.Error as e:
+            with suppress(sqlite3.Error):
+                self._db.execute("ROLLBACK")
             raise DiskError(f"{self._path}: cannot be written: {_reason(e)}; --resume goes on") from e
 
     def close(self) -> None:
-        with suppress(sqlite3.Error):
-            self._db.execute("PRAGMA journal_mode = DELETE")
-            self._db.close()
-        if self._held is not None:
-            self._held.close()
+        if self._db is not None:
+            with suppress(sqlite3.Error):
+                if self._begun:
+                    self._db.execute("PRAGMA journal_mode = DELETE")
+                self._db.close()
+            if not self._begun and not self._was_there:
+                self._path.unlink(missing_ok=True)
+        self._lock.release()
+
+
+_DELETE: Final = "DELETE FROM recordings WHERE recording = ?"
+_FINISH: Final = "UPDATE made SET value = 'done' WHERE key = 'state'"
 
 
 def _reason(e: Exception) -> str:
     return (e.strerror if isinstance(e, OSError) else None) or str(e)
 
 
-def _lock(file: BinaryIO, path: Path) -> None:
-    """Against another process that writes the same table; until the file is closed.
-    Raises DeviceInUse, OSError."""
-    try:
-        import fcntl  # which Windows has not
-    except ImportError:
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise DeviceInUse(f"{path}: another process writes this table") from None
+class _Lock:
+    """Against another process that writes the same table: a lock of a file beside it,
+    which other machines respect, too, where the file system is shared. Raises
+    DeviceInUse; InputError where the folder takes no file."""
+
+    def __init__(self, table: Path) -> None:
+        self._path = table.with_name(table.name + LOCK)
+        self._file: BinaryIO | None = None
+        require_writable(self._path)
+        try:
+            import fcntl  # which Windows has not
+        except ImportError:
+            return
+        try:
+            while True:
+                file = open(self._path, "ab")  # noqa: SIM115 - until `release`; NFS wants it writable
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    if os.path.samestat(os.fstat(file.fileno()), os.stat(self._path)):
+                        self._file = file
+                        return
+                except FileNotFoundError:
+                    pass  # whoever had it has just ended and removed it
+                except BaseException:
+                    file.close()
+                    raise
+                file.close()
+        except BlockingIOError:
+            raise DeviceInUse(f"{table}: another process writes this table") from None
+        except OSError as e:
+            raise InputError(f"{self._path}: cannot be written: {e.strerror}") from e
+
+    def release(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                self._path.unlink()
+            self._file.close()
+            self._file = None

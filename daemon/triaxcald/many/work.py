@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Final, Generic, TypeVar
@@ -51,8 +52,12 @@ COMMON_AFTER: Final = (
     _common("error", Kind.TEXT, "why there is no result; else empty"),
     _common("seconds", Kind.NUMBER, "time that it took [s]"),
     _common("size", Kind.WHOLE, "size of the file [bytes]"),
-    _common("stamp", Kind.TEXT, "modification time [ns since 1970], or the store's ETag"),
-    _common("sha256", Kind.TEXT, "SHA-256 of the file"),
+    _common(
+        "stamp",
+        Kind.TEXT,
+        "modification time [ns since 1970], or the store's ETag; after a `+` a digest of those of files beside it",
+    ),
+    _common("sha256", Kind.TEXT, "SHA-256 of the file; empty where it could not be read"),
     _common("software", Kind.TEXT, "version of triaxcal that computed the row"),
     _common("settings", Kind.TEXT, "digest of command and options"),
 )
@@ -127,7 +132,8 @@ def attempt(work: Work, source: Source, settings: Settings, *, supervised: bool 
 def _attempt(work: Work, source: Source, settings: Settings, here: str, supervised: bool) -> Done:
     began_s = time.monotonic()
     path = path_of(source.name)
-    digest = None
+    digest: str | None = None
+    error: Exception | None = None
     try:
         _warm()
         with bounded(settings.memory):
@@ -135,9 +141,10 @@ def _attempt(work: Work, source: Source, settings: Settings, here: str, supervis
             digest = digest_of(path)
     except tc.Refused as e:
         wanted = f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""
-        finding = failed(f"{source.name}: refused: {e}{wanted}", exit_code_of(e))
+        finding, error = failed(f"{source.name}: refused: {e}{wanted}", exit_code_of(e)), e
     except (tc.TriaxcalError, td.DriverError, DaemonError) as e:
         finding = failed(str(e) if source.name in str(e) else f"{source.name}: {e}", exit_code_of(e))
+        error = e
     except Exception as e:
         if ran_out_of_memory(e):
             e.__traceback__ = e.__context__ = None  # and all that its frames hold
@@ -148,6 +155,9 @@ def _attempt(work: Work, source: Source, settings: Settings, here: str, supervis
             raise
         else:
             finding = failed(f"{source.name}: internal error: {type(e).__name__}: {e}", DEVICE)
+    if error is not None and not _of_this_process(error):
+        with suppress(Exception), bounded(settings.memory):  # stores have errors of their own
+            digest = digest_of(path)
     row = {
         "recording": source.name,
         "exit_code": finding.exit_code,
@@ -161,6 +171,16 @@ def _attempt(work: Work, source: Source, settings: Settings, here: str, supervis
         "settings": settings.digest,
     }
     return Done(source.name, row, finding.lines, finding.document, finding.written)
+
+
+def _of_this_process(e: BaseException | None) -> bool:
+    """Whether it lacks a package, or may not read a file: another process, or another
+    time, may come out otherwise."""
+    while e is not None:
+        if isinstance(e, ImportError | PermissionError | td.DriverMissing):
+            return True
+        e = e.__cause__ or e.__context__
+    return False
 
 
 def failed(error: str, exit_code: int) -> Finding:

@@ -263,6 +263,15 @@ class Attachments(Mapping[str, bytes]):
         return len(self._offsets)
 
 
+@dataclass(frozen=True)
+class Learned:
+    """By the offset of a chunk the topics of its messages and the channels that it
+    declares; and all channels that are declared, with their topics."""
+
+    known: Mapping[int, tuple[frozenset[str], dict[int, str]]]
+    topics: Mapping[int, str]
+
+
 class Recording(Contents):
     """One recording's file, opened.
 
@@ -401,6 +410,16 @@ class Recording(Contents):
         self._known |= known
         return Index(topics, phases)
 
+    @property
+    def learned(self) -> Learned:
+        """What is known of its chunks so far."""
+        return Learned(dict(self._known), dict(self._topics))
+
+    def learn(self, learned: Learned) -> None:
+        """What was known of the same file when it was opened before."""
+        self._known |= learned.known
+        self._topics |= learned.topics
+
     def _counted_phases(self) -> dict[str, schema.PhaseCount] | None:
         """As they were counted when the file was closed; None where they were not, or
         where records are unconfirmed."""
@@ -532,6 +551,8 @@ class Series(Contents):
             for s in self.manifest.segments
             if s.unconfirmed is not None
         ]
+        self._learned: dict[str, Learned] = {}
+        """Of the index of each segment, for when it is opened again."""
         self._first = self._opened(self.manifest.segments[0])
         own = (schema.SEGMENT_RECORD, schema.RAW_RECORD)
         self.metadata = {name: record for name, record in self._first.metadata.items() if name not in own}
@@ -568,6 +589,8 @@ class Series(Contents):
                 if (found := recording.index()) is None:
                     return None
                 whole.add(found)
+                self._learned[segment.file] = recording.learned
+        self._first.learn(self._learned[self.manifest.segments[0].file])
         return whole
 
     def _require_there(self, segment: Segment) -> None:
@@ -604,7 +627,10 @@ class Series(Contents):
         path = self.manifest.path_of(segment)
         if segment.state != "open" and digest_of(path) != segment.sha256:
             raise RecordingError(f"{self.name}: segment {segment.file}: was changed since it was recorded")
-        return Recording.open(path, unfinished=segment.state != "closed")
+        recording = Recording.open(path, unfinished=segment.state != "closed")
+        if segment.file in self._learned:
+            recording.learn(self._learned[segment.file])
+        return recording
 
 
 def _alike(one: bytes, other: bytes) -> bool:

@@ -89,13 +89,15 @@ def _ended(popen: subprocess.Popen[str]) -> None:
 
 @pytest.fixture
 def cluster(tmp_path: Path, until: Callable[..., Any], process: Callable[..., Any]) -> Callable[..., str]:
-    """A `dask scheduler` and two separate `dask worker`s; gives the scheduler's address."""
+    """A `dask scheduler` and two separate `dask worker`s; gives the scheduler's address. It may find its modules
+    elsewhere."""
 
-    def start(memory: str = "500MB", **more: str) -> str:
+    def start(memory: str = "500MB", modules_of_scheduler: Path | None = None, **more: str) -> str:
         file = tmp_path / "scheduler.json"
         quiet = {"DASK_LOGGING__DISTRIBUTED": "error", **more}
+        own = quiet if modules_of_scheduler is None else {**quiet, "PYTHONPATH": str(modules_of_scheduler)}
         process("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard",
-                "--scheduler-file", file, **quiet)  # fmt: skip
+                "--scheduler-file", file, **own)  # fmt: skip
         until(lambda: file.exists() and file.read_text().endswith("}"))
         for i in range(2):
             process(

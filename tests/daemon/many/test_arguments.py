@@ -20,6 +20,8 @@ CASES = [
     ("audit {} --jobs two", "--jobs"),
     ("audit {} --jobs 2 --scheduler tcp://127.0.0.1:1", "not allowed with"),
     ("audit {} --memory 0", "--memory"),
+    ("audit {} --memory 100M --jobs 2", "at least 200M"),
+    ("audit file://[a", "file://[a"),
     ("audit {} -o {f}/t.xlsx", "expected a name that ends in .parquet, .csv, .csv.gz, .sqlite"),
     ("audit {} -o {f}/none/t.csv", "there is no folder"),
     ("audit {} --resume", "--resume: give the table"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any
 import pytest
 
 from tests.daemon.many.conftest import CAN, TABLE, rows_of
+from triaxcald.cli.many import published
+from triaxcald.many import Done, open_table
 
 Run = Callable[..., Any]
 
@@ -149,3 +153,72 @@ def test_an_attitude_file_goes_to_the_worker(folder: Path, triaxcal: Run) -> Non
     assert done.code in (2, 3)
     [row] = rows_of(folder / "t.csv")
     assert "att.txt" in row["error"] or "attitudes" in row["error"]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_apply_needs_no_hard_links(
+    folder: Path, applied: Callable[..., Any], links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer of a file system without them is put in."""
+
+    def link(*_: Any, **__: Any) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    if not links:
+        monkeypatch.setattr(os, "link", link)
+    assert applied().code == 0
+    out = folder / "out" / "t.csv"
+    assert out.stat().st_size > 1000
+    assert [p.name for p in out.parent.iterdir()] == ["t.csv"]
+    done = Done("r", {"exit_code": 0, "error": None, "recording": "r"}, written=(str(folder / "part"), str(out)))
+    (folder / "part").write_text("another's")
+    with open_table(None, "x", (), resume=False) as nowhere:
+        refused = published(done, nowhere, None)
+    assert (refused.exit_code, refused.error) == (2, f"{out}: exists already")
+    assert not (folder / "part").exists()
+    assert out.stat().st_size > 1000
+
+
+def test_what_a_killed_worker_left_of_a_file_goes(folder: Path, applied: Callable[..., Any]) -> None:
+    (folder / "out").mkdir()
+    for name in (".t.csv.0123abcd.part", ".other.csv.0123abcd.part"):
+        (folder / "out" / name).write_text("half")
+    assert applied().code == 0
+    assert sorted(p.name for p in (folder / "out").iterdir()) == [".other.csv.0123abcd.part", "t.csv"]
+
+
+@pytest.mark.parametrize("asked", ["t.csv.gz", ".", "*.csv.gz"])
+def test_apply_leaves_no_recording_out_in_silence(
+    folder: Path, applied: Callable[..., Any], triaxcal: Run, asked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    arguments = ("--calibration", "t.cal.json", "--to", ".", "-o", folder.parent / "t.csv")
+    triaxcal("batch", "apply", asked, *arguments).failed(2, "lies in --to")
+
+
+def test_no_recording_at_all_is_2(folder: Path, triaxcal: Run) -> None:
+    (folder / "below").mkdir()
+    table = folder / "below" / "fit.csv"  # the only file in this folder
+    assert triaxcal("batch", "poses", folder / "t.csv.gz", "-o", table).code == 0
+    before = table.read_bytes()
+    triaxcal("batch", "poses", table.parent, "-o", table).failed(2, "no recording is left")
+    assert table.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.sqlite"])
+def test_a_scheduler_that_does_not_answer_leaves_the_finished_table(folder: Path, triaxcal: Run, name: str) -> None:
+    (folder / "empty").mkdir()
+    assert triaxcal("batch", "poses", folder / "t.csv.gz", "-o", folder / name).code == 0
+    before = (folder / name).read_bytes()
+    asked = ("batch", "poses", folder / "empty", folder / "t.csv.gz", "-o", folder / name)
+    triaxcal(*asked, "--scheduler", "tcp://127.0.0.1:1").failed(2, "no Dask scheduler answers")
+    assert (folder / name).read_bytes() == before
+    assert not (folder / f"{name}.journal").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--resume",)], ids=str)
+def test_a_recording_is_not_overwritten_by_the_table(folder: Path, triaxcal: Run, options: tuple[str, ...]) -> None:
+    before = (folder / "t.csv.gz").read_bytes()
+    for _ in range(2):
+        triaxcal("batch", "poses", folder / "broken.mcap", "-o", folder / "t.csv.gz", *options).failed(2, "no column")
+    assert (folder / "t.csv.gz").read_bytes() == before

@@ -124,6 +124,33 @@ def test_no_scheduler_and_workers_of_another_version(
         list(results(connected, works.tells, sources("a"), Settings("x", "99")))
 
 
+def test_a_scheduler_without_triaxcal_is_named(
+    cluster: Callable[..., str], sources: Callable[..., list[Source]], tmp_path: Path
+) -> None:
+    modules = tmp_path / "modules"
+    for name in ("triaxcald", "tests"):  # they hide those that are installed
+        (modules / name).mkdir(parents=True)
+        (modules / name / "__init__.py").write_text("raise ImportError('there is none')\n")
+    with (
+        cluster_at(cluster(modules_of_scheduler=modules)) as connected,
+        pytest.raises(InputError, match="the scheduler cannot load triaxcal"),
+    ):
+        list(results(connected, works.tells, sources("a"), Settings("x")))
+
+
+def test_paths_and_trust_reach_workers_that_start_elsewhere(
+    cluster: Callable[..., str], recordings: Callable[..., Path], triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = recordings(1, CAN)
+    (folder / "keys.toml").write_text('format = "triaxcal.trust/1"\nsince = "2020-01-01T00:00:00+00:00"\n')
+    address = cluster()
+    monkeypatch.chdir(folder)
+    triaxcal("audit", "r00.mcap", "--trust", "keys.toml", "-o", "t.csv", "--scheduler", address)
+    [row] = rows_of(folder / "t.csv")
+    assert row["recording"] == str(folder / "r00.mcap")
+    assert (row["error"], row["signature"], row["exit_code"]) == ("", "unsigned", "1")
+
+
 # Processes of our own.
 
 
@@ -216,15 +243,17 @@ def test_an_interrupted_run_resumes(
         assert after[: len(before)] == before  # these rows were not written again
 
 
-def test_resumed_on_a_finished_table_nothing_is_done_again(recordings: Callable[..., Path], triaxcal: Run) -> None:
+def test_resumed_on_a_finished_table_only_what_has_changed_is_done_again(
+    recordings: Callable[..., Path], triaxcal: Run
+) -> None:
+    """A row that was not written again keeps what a program put into it."""
     folder = recordings(3, TABLE)
-    first = triaxcal("batch", "poses", folder, "-o", folder / "t.csv")
-    rows = rows_of(folder / "t.csv")
-    (folder / "r01.csv.gz").touch()
+    table = folder / "t.sqlite"
+    assert triaxcal("batch", "poses", folder, "-o", table).code == 0
+    with sqlite3.connect(table) as db:
+        db.execute("UPDATE recordings SET poses = -1")
     os.utime(folder / "r01.csv.gz", ns=(1, 1))
-    second = triaxcal("batch", "poses", folder, "-o", folder / "t.csv", "--resume")
-    assert (first.code, second.code) == (0, 0)
-    again = rows_of(folder / "t.csv")
-    assert [again[0], again[2]] == [rows[0], rows[2]]
-    assert (rows[1]["stamp"], again[1]["stamp"]) != ("1", "")
-    assert again[1]["stamp"] == "1"
+    assert triaxcal("batch", "poses", folder, "-o", table, "--resume").code == 0
+    with sqlite3.connect(table) as db:
+        found = list(db.execute("SELECT poses, stamp = '1' FROM recordings ORDER BY recording"))
+    assert found == [(-1, 0), (14, 1), (-1, 0)]

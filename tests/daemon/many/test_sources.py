@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,7 +61,7 @@ def test_a_manifest_lists_paths_from_its_own_folder(folder: Path) -> None:
 def test_what_is_no_manifest_is_named_with_its_line(tmp_path: Path, content: bytes, words: str) -> None:
     manifest = tmp_path / "all.list"
     manifest.write_bytes(content)
-    [found] = sources_of([str(manifest)], MCAP)
+    found = sources_of([str(manifest)], MCAP)[-1]
     assert isinstance(found, Unusable)
     assert words in found.error
     assert found.exit_code == 2
@@ -76,3 +79,45 @@ def test_a_manifest_of_segments_stands_for_its_segments(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert names([str(tmp_path)], (".mcap", ".segments.json")) == ["a.segments.json", "b-000001.mcap"]
     assert names([str(tmp_path)]) == ["a-000001.mcap", "a-000002.mcap", "b-000001.mcap"]
+
+
+def test_a_bad_entry_of_a_list_hides_no_other(folder: Path) -> None:
+    manifest = folder / "all.list"
+    entries = ("odd://x/a.mcap", "a.mcap", "file://[x", "x" * 5000, "https://[x/a.mcap", "b.mcap")
+    manifest.write_text("\n".join(entries))
+    found = sources_of([str(manifest)], MCAP)
+    assert [isinstance(of, Source) for of in found] == [False, True, False, False, False, True]
+    assert {of.exit_code for of in found if isinstance(of, Unusable)} == {2}
+
+
+def test_a_url_that_is_none_is_an_error_of_its_own(folder: Path) -> None:
+    [bad, good] = sources_of(["file://[a", str(folder / "a.mcap")], MCAP)
+    assert isinstance(bad, Unusable)
+    assert (bad.name, bad.exit_code) == ("file://[a", 2)
+    assert isinstance(good, Source)
+
+
+def test_a_folder_that_cannot_be_looked_into_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root may look into every folder, so the system's answer is put in."""
+    true = os.scandir
+
+    def scandir(path: str) -> Any:
+        if Path(path).name == "below":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return true(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    *found, closed = sources_of([str(folder)], MCAP)
+    assert [Path(of.name).name for of in found] == ["a.mcap", "b.mcap"]
+    assert closed == Unusable(
+        str(folder / "below"), f"{folder / 'below'}: cannot be looked into: {os.strerror(errno.EACCES)}", 2
+    )
+    assert [type(of) for of in sources_of([str(folder / "below")], MCAP)] == [Unusable]
+
+
+def test_paths_for_workers_are_absolute(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    found = sources_of(["a.mcap", "below", "memory://x/c.mcap"], MCAP, absolute=True)
+    assert [of.name for of in found] == [str(folder / "a.mcap"), str(folder / "below" / "c.mcap"), "memory://x/c.mcap"]
+    assert isinstance(found[0], Source)
+    assert found[0].size == 6

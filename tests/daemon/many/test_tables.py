@@ -127,6 +127,8 @@ def test_a_journal_cut_within_its_first_line_begins_anew(tmp_path: Path) -> None
         ({"exit_code": 1}, True),
         ({"exit_code": 2, "error": "broken"}, True),
         ({"exit_code": 3, "error": "refused"}, True),
+        ({"exit_code": 2, "error": "the store refuses", "sha256": None}, False),
+        ({"exit_code": 3, "error": "refused", "sha256": ""}, False),
         ({"exit_code": 4, "error": "internal"}, False),
         ({"exit_code": 5, "error": "memory ran out"}, False),
     ],
@@ -134,6 +136,12 @@ def test_a_journal_cut_within_its_first_line_begins_anew(tmp_path: Path) -> None
 )
 def test_a_row_counts_where_nothing_has_changed(change: dict[str, Any], current: bool) -> None:
     assert is_current(row_of(SOURCE.name, **change), SOURCE, SETTINGS) is current
+
+
+def test_a_stamp_that_is_empty_reads_back_as_such() -> None:
+    unstamped = replace(SOURCE, stamp="")
+    for stored in ("", None):
+        assert is_current(row_of(SOURCE.name, stamp=stored), unstamped, SETTINGS)
 
 
 def test_a_recording_of_which_nothing_is_known_is_never_taken_over() -> None:
@@ -186,37 +194,144 @@ def test_what_cannot_be_a_table_is_refused(tmp_path: Path, name: str, make: Call
         opened(tmp_path / name)
 
 
-@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
-def test_a_table_of_others_is_not_gone_on_with(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("name", ["t.csv", "t.csv.gz", "t.parquet"])
+def test_a_file_that_is_no_table_of_results_is_left_alone(tmp_path: Path, name: str, resume: bool) -> None:
+    """However often it is tried: a recording may have such a name, too."""
     import pandas as pd
 
+    path = tmp_path / name
     frame = pd.DataFrame({"recording": ["a"], "x": [1]})
-    frame.to_csv(tmp_path / name) if name == "t.csv" else frame.to_parquet(tmp_path / name)
-    with pytest.raises(InputError, match="no column"):
-        opened(tmp_path / name, resume=True)
+    frame.to_parquet(path) if name == "t.parquet" else frame.to_csv(path)
+    before = path.read_bytes()
+    for _ in range(3):
+        with pytest.raises(InputError, match="no column"):
+            opened(path, resume=resume)
+        assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert path.read_bytes() == before
 
 
-def test_rows_of_other_columns_are_made_again(tmp_path: Path) -> None:
-    path = tmp_path / "t.sqlite"
+@pytest.mark.parametrize("cut", [0.3, 0.9])
+@pytest.mark.parametrize("name", ["t.csv.gz", "t.parquet"])
+def test_a_damaged_table_is_not_gone_on_with(tmp_path: Path, name: str, cut: float) -> None:
+    path = tmp_path / name
+    with opened(path) as table:
+        for i in range(50):
+            table.store(row_of(f"r{i}"))
+        table.finish([])
+    path.write_bytes(data := path.read_bytes()[: int(cut * path.stat().st_size)])
+    with pytest.raises(InputError, match=name):
+        opened(path, resume=True)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_table_of_other_columns_is_not_gone_on_with(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
     with opened(path) as table:
         table.store(row_of("a"))
-    with open_table(path, "audit", (*COLUMNS, Column("new", Kind.TEXT, "", str)), resume=True) as table:
+        table.finish(["a"])
+    before = path.read_bytes()
+    more = (*COLUMNS, Column("new", Kind.TEXT, "", str))
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"of `triaxcal audit`.* column"):
+            open_table(path, "audit", more, resume=True)
+        assert path.read_bytes() == before
+    with open_table(path, "audit", more, resume=False) as table:  # it is ours, and is replaced
+        table.store(row_of("b", new="x"))
+        table.finish(["b"])
+    with open_table(path, "audit", more, resume=True) as table:
         assert table.stored("a") is None
-        table.store(row_of("a", new="x"))
-        found = table.stored("a")
-    assert found is not None
-    assert found["new"] == "x"
+        assert table.stored("b") == row_of("b", new="x")
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("name", KINDS)
+def test_a_start_of_which_nothing_comes_leaves_the_finished_table(tmp_path: Path, name: str, resume: bool) -> None:
+    path = tmp_path / name
+    with opened(path, resume=resume):
+        pass
+    assert not list(tmp_path.iterdir())
+    with opened(path) as table:
+        table.store(row_of("a"))
+        table.finish(["a"])
+    before = path.read_bytes()
+    with opened(path, resume=resume):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert path.read_bytes() == before
+    with opened(path, resume=True) as table:
+        assert table.stored("a") == row_of("a")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_a_kill_at_the_start_of_resume_loses_no_row_of_the_finished_table(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    with opened(path) as table:
+        for i in range(200):
+            table.store(row_of(f"r{i}"))
+        table.finish([])
+    code = f"""
+import os, signal, sys
+from pathlib import Path
+from tests.daemon.many.test_tables import opened
+from triaxcald.many import tables
+true, count = tables._line, 0
+def line(value):
+    global count
+    count += 1
+    if count == 150:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return true(value)
+tables._line = line
+opened(Path({str(path)!r}), resume=True)
+"""
+    done = subprocess.run([sys.executable, "-c", code], env=environment(), check=False, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    with opened(path, resume=True) as table:
+        assert all(table.stored(f"r{i}") == row_of(f"r{i}") for i in range(200))
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("name", KINDS)
+def test_a_table_that_is_being_written_is_named_as_such(tmp_path: Path, name: str, resume: bool) -> None:
+    with opened(tmp_path / name) as table:
+        table.store(row_of("a"))
+        with pytest.raises(DeviceInUse, match="another process writes this table"):
+            opened(tmp_path / name, resume=resume)
+        table.store(row_of("b"))
+        table.finish(["a", "b"])
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_error_of_an_argument_goes_once_the_argument_is_mended(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    nothing = {"exit_code": 2, "error": "no recording", "size": None, "stamp": None, "sha256": None}
+    with opened(path) as table:
+        for argument in ("day", "day/below", "days", "other"):
+            table.store(row_of(argument, **nothing))
+        table.store(row_of("day/broken.mcap", exit_code=2, error="broken", sha256=None))
+        table.finish(["day"], ["day"])
+    with opened(path, resume=True) as table:
+        table.store(row_of("day/a.mcap"))
+        table.finish(["day/a.mcap"], ["day"])
+    with opened(path, resume=True) as table:
+        left = [n for n in ("day", "day/below", "days", "other", "day/broken.mcap", "day/a.mcap") if table.stored(n)]
+    assert left == ["days", "other", "day/broken.mcap", "day/a.mcap"]
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_name_that_is_no_text_and_a_figure_that_is_no_number(tmp_path: Path, name: str) -> None:
-    odd = "r/\udcff.mcap"
+    odd = "r/\udcff\r.mcap"
     with opened(tmp_path / name) as table:
         table.store(row_of(odd, value=float("nan"), error="half \ud800"))
         table.finish([odd])
     with opened(tmp_path / name, resume=True) as table:
         found = table.stored(odd)
-    assert found == row_of("r/\\udcff.mcap", value=None, error="half \\ud800")
+    assert found == row_of("r/\\udcff\r.mcap", value=None, error="half \\ud800")
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import triaxcal as tc
 from tests.daemon.many import works
 from tests.daemon.many.conftest import environment
 from triaxcald.errors import InputError
-from triaxcald.many import Finding, Settings, Source, attempt
+from triaxcald.many import Finding, Settings, Source, attempt, is_current
 from triaxcald.many.work import WrongVersion
 
 
@@ -57,6 +57,36 @@ def test_every_error_is_a_row_that_names_the_recording(source: Source, error: Ex
     assert words in done.error
     assert source.name in done.error
     assert "\n" not in done.error
+
+
+@pytest.mark.parametrize(
+    ("error", "cause", "read"),
+    [
+        (InputError("no table"), None, True),
+        (tc.Refused("too few"), None, True),
+        (InputError("the store refuses"), PermissionError(13, "credentials expired"), False),
+        (InputError("the package s3fs is not installed"), ModuleNotFoundError(name="s3fs"), False),
+        (ModuleNotFoundError("No module named 's3fs'", name="s3fs"), None, False),
+        (MemoryError("none"), None, False),
+    ],
+    ids=repr,
+)
+def test_an_error_of_the_recording_has_its_digest_and_one_of_the_process_none(
+    source: Source, error: Exception, cause: Exception | None, read: bool
+) -> None:
+    def work(path: Any) -> Finding:
+        raise error from cause
+
+    done = attempt(work, source, Settings("d1"))
+    assert done.row["sha256"] == (hashlib.sha256(b"abc").hexdigest() if read else None)
+    assert is_current(done.row, source, Settings("d1")) is read
+
+
+def test_a_recording_that_this_machine_has_not_is_tried_again(source: Source) -> None:
+    Path(source.name).unlink()
+    done = attempt(works.reads, source, Settings("d1"))
+    assert (done.exit_code, done.row["size"]) == (2, source.size)
+    assert not is_current(done.row, source, Settings("d1"))
 
 
 def test_an_error_in_the_one_recording_asked_for_keeps_its_trace(source: Source) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from triaxcald.many import Finding
+from triaxcald.recording.reader import digest_of
 
 FIFO = "fifo"
 """Beside the recordings; nobody writes to it."""
@@ -18,6 +19,10 @@ FIFO = "fifo"
 
 def tells(path: Any) -> Finding:
     return Finding({"pid": os.getpid()})
+
+
+def reads(path: Path) -> Finding:
+    return Finding({"pid": len(digest_of(path))})
 
 
 def holds_once(path: Path) -> Finding:

@@ -14,7 +14,7 @@ from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.audit import audit
 from triaxcald.errors import DiskError, RecordingError
-from triaxcald.recording import disk, schema
+from triaxcald.recording import disk, reader, schema
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.info import describe
 from triaxcald.recording.manifest import Retention, load_manifest
@@ -193,6 +193,29 @@ def test_the_segments_are_read_as_one_stream(
         assert (series.metadata["unit"], "segment" in series.metadata) == ({"serial": "42"}, False)
         assert dict(series.attachments) == {"station.toml": b"name = 'bench'\n"}
         assert [e.kind for e in series.events()].count("minute") == 3
+
+
+def test_the_index_of_each_segment_is_kept_for_when_it_is_opened_again(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with new() as writer:
+        minutes(writer, 3)
+    unpacked: list[str] = []
+    real = reader.chunk_data
+    monkeypatch.setattr(reader, "chunk_data", lambda unparsed, name: unpacked.append(name) or real(unparsed, name))
+    with Series(tmp_path / "rec.segments.json") as series:
+        index = series.index()
+        assert index is not None
+        assert sum(m.messages for m in index.topics.values()) == sum(1 for _ in series.messages())
+        unpacked.clear()
+        assert not list(series.messages("of no segment"))
+        assert unpacked == []
+        events = [(e.time_ns, e.kind) for e in series.events()]
+    with Series(tmp_path / "rec.segments.json") as series:
+        assert [(e.time_ns, e.kind) for e in series.events()] == events
+        unpacked.clear()
+        assert not list(series.messages("of no segment"))
+        assert len(unpacked) >= 2
 
 
 def test_a_recording_goes_on_behind_the_manifest_that_is_there(
