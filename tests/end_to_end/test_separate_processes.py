@@ -20,7 +20,7 @@ UNIT = {
     "unit", "exit_code", "error", "wanted_poses", "data_quality", "serial", "recording", "certificate", "report",
     "before", "after",
     "findings", "candidates", "choices", "registers_written", "verification", "device_state", "records_lost",
-    "outcome", "outcome_file",
+    "outcome", "outcome_file", "signature_file",
 }  # fmt: skip
 
 

@@ -283,7 +283,7 @@ def audit_command(a: argparse.Namespace) -> int:
     _require_agreeing(a)
     elsewhere = a.scheduler is not None  # workers start from another folder
     trust = a.trust.absolute() if elsewhere and a.trust is not None else a.trust
-    policy = Policy(trust, a.allow_unsigned)
+    policy = Policy(trust, a.allow_unsigned, tuple(Path(r).resolve() for r in a.recordings if os.path.isdir(r)))
     chains, broken = _audited_chains(a, policy)
     found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS, absolute=elsewhere)
     if a.as_made:

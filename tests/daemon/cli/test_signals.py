@@ -86,7 +86,7 @@ def test_a_file_that_was_there_before_is_left_alone(tmp_path: Path) -> None:
     path.write_text("old")
     code = """
 from triaxcald import files
-files.open = lambda *_: raise_signal(SIGTERM)
+files.open = lambda *_, **__: raise_signal(SIGTERM)
 with files.new_file(Path(sys.argv[1])): pass
 """
     assert _python(code, path).returncode == 130

@@ -44,3 +44,15 @@ def test_signatures_are_judged_by_the_policy_before_earlier_versions_run(
     assert broken.exit_code == 2
     assert len(signed) == 4
     assert earlier.name == "earlier.mcap"
+
+
+def test_a_trust_file_planted_below_the_folder_does_not_count(
+    line: Line, keys: dict[str, SigningKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    planted = line.folder / "2025"
+    planted.mkdir()
+    line.made[1].rename(planted / line.made[1].name)
+    trusted(planted, "2020-01-01T00:00:00+00:00", keys["stranger"])
+    main(["audit", str(line.folder), "--json"])
+    audits = json.loads(capsys.readouterr().out)["audits"]
+    assert {one["signature"]["trust"] for one in audits} == {str(line.folder / "trust.toml")}
