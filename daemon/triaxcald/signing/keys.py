@@ -155,9 +155,9 @@ def read_public(path: Path) -> bytes:
     return found.public_bytes_raw()
 
 
-def read_private(path: Path, passphrase: bytes | None) -> SigningKey:
+def read_private(path: Path, passphrase: bytes | None, given_by: str = "--passphrase-file") -> SigningKey:
     """A private key in PEM. Raises InputError: unreadable, another kind, a wrong or
-    missing passphrase."""
+    missing passphrase, which ``given_by`` or the environment gives."""
     with loaded():
         from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -165,7 +165,7 @@ def read_private(path: Path, passphrase: bytes | None) -> SigningKey:
     data = _read(path)
     encrypted = b"BEGIN ENCRYPTED PRIVATE KEY" in data
     if encrypted and passphrase is None:
-        raise InputError(f"{path}: needs its passphrase: {PASSPHRASE} in the environment, or --passphrase-file")
+        raise InputError(f"{path}: needs its passphrase: {PASSPHRASE} in the environment, or {given_by}")
     try:
         pair = load_pem_private_key(data, passphrase if encrypted else None)
     except (ValueError, TypeError, UnsupportedAlgorithm):

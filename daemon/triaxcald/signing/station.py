@@ -257,7 +257,7 @@ def _key_of(station: Station, sign: Sign | None, trust: Trust | None) -> Signing
         raise InputError(f"{path}: cannot be read: {e.strerror}") from e
     opened = (str(path.resolve()), made, hashlib.sha256(passphrase or b"").hexdigest())
     if opened not in _opened:
-        _opened[opened] = read_private(path, passphrase)
+        _opened[opened] = read_private(path, passphrase, f"sign.passphrase_file in {station.path}")
     return _opened[opened]
 
 

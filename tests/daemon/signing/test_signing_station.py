@@ -357,6 +357,17 @@ def test_a_run_is_signed_trusted_and_in_the_chain(workshop: Workshop, capsys: py
     assert main(["audit", str(recording), "--trust", str(folder / "trust.toml")]) == 0
 
 
+def test_a_missing_passphrase_is_asked_for_by_the_key_of_the_station_file(
+    workshop: Workshop, station: Callable[..., Station]
+) -> None:
+    """A run has no option for it."""
+    _encrypted(workshop.folder)
+    with pytest.raises(InputError) as raised:
+        signing_of(station())
+    assert "sign.passphrase_file" in str(raised.value)
+    assert "--passphrase-file" not in str(raised.value)
+
+
 def test_the_environment_is_asked_once_for_a_key_that_costs_time(
     workshop: Workshop, station: Callable[..., Station], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -367,9 +378,9 @@ def test_the_environment_is_asked_once_for_a_key_that_costs_time(
     read: list[Path] = []
     of_file = module.read_private
 
-    def counted(path: Path, passphrase: bytes | None) -> SigningKey:
+    def counted(path: Path, passphrase: bytes | None, given_by: str) -> SigningKey:
         read.append(path)
-        return of_file(path, passphrase)
+        return of_file(path, passphrase, given_by)
 
     monkeypatch.setattr(module, "read_private", counted)
     first, second = signing_of(station()), signing_of(station())
