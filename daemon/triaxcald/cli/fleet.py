@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import triaxcal as tc
@@ -37,6 +37,8 @@ def fleet_command(a: argparse.Namespace) -> int:
     told = {option: text for option, text in (("--since", a.since), ("--until", a.until)) if text is not None} | told
     runs = read_runs(a.source, Selection(since_us, until_us, equal), _reading)
     fleets = fleets_of(runs)
+    if not fleets and a.output is not None:
+        raise _nothing_measured(a.source, told)
     at("statistics")
     asked = Asked(a.limit, a.probability, told)
     made = fleet_document(
@@ -61,8 +63,13 @@ def fleet_command(a: argparse.Namespace) -> int:
         more = f" and {len(runs.skipped) - NAMED_MOST} more" if len(runs.skipped) > NAMED_MOST else ""
         say(f"{_shown(a.source)}: left out, not readable: {', '.join(runs.skipped[:NAMED_MOST])}{more}")
     if not fleets:
-        raise InputError(f"{_shown(a.source)}: no run has measured anything")
+        raise _nothing_measured(a.source, told)
     return 0
+
+
+def _nothing_measured(source: str, chosen: Mapping[str, str]) -> InputError:
+    of = f" of {', '.join(f'{option} {text}' for option, text in chosen.items())}" if chosen else ""
+    return InputError(f"{_shown(source)}: no run{of} has measured anything")
 
 
 def _shown(source: str) -> str:

@@ -375,6 +375,13 @@ def test_an_empty_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "no run has measured anything" in capsys.readouterr().err
 
 
+def test_a_filter_that_no_run_passes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odds = tmp_path / "odds.json"
+    assert main(["fleet", str(tmp_path), "--part-number", "TX-1", "-o", str(odds)]) == 2
+    assert "no run of --part-number TX-1 has measured anything" in capsys.readouterr().err
+    assert not odds.exists()
+
+
 # Effects of places, and odds.
 
 
