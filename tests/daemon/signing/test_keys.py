@@ -320,8 +320,11 @@ def token(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @with_token
 def test_a_key_in_a_token_signs_and_never_leaves_it(folder: Path, token: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pkcs11
+
     from triaxcald.signing.hsm import open_key
 
+    pkcs11.lib(str(token)).reinitialize()  # a login of another test holds for the whole process
     monkeypatch.setenv(PASSPHRASE, "1234")
     made = ["keys", "new", "line-1", "--module", str(token), "--token", "station"]
     assert main(made) == 0
