@@ -39,6 +39,8 @@ class ChainAudit:
     tombstones: int = 0
     earlier: int = 0
     head: tuple[int, str] | None = None
+    doubtful: int = 0
+    """Tombstones whose signature does not hold, or is of a key that is not trusted."""
 
     @property
     def exit_code(self) -> int:
@@ -137,6 +139,7 @@ class _ChainAudit:
     known_head: str | None
     differences: list[Difference] = field(default_factory=list)
     _keys: set[str] = field(default_factory=set)
+    _doubtful: dict[tuple[str, str | None], int] = field(default_factory=dict)
 
     def run(self) -> ChainAudit:
         # A run may end meanwhile. What it adds to the chain after this is an entry too.
@@ -154,7 +157,10 @@ class _ChainAudit:
             return ChainAudit(str(self.folder), tuple(self.differences))
         entries = entries or self._entries(path)
         self._keys = {one.envelope.key_id for one in signed}
+        if not signed:  # all were deleted: nothing but the chain's start names a key
+            self._keys = {e.envelope.key_id for e in entries[:1] if e.envelope is not None}
         start, tombstones = self._said(entries)
+        doubtful = len(self._doubtful)
         self._linked(entries, signed)
         self._removed(entries, tombstones, signed)
         extra = self._inserted(entries, signed)
@@ -169,6 +175,7 @@ class _ChainAudit:
             len(tombstones),
             earlier,
             (entries[-1].number, entries[-1].digest) if entries else None,
+            doubtful,
         )
 
     def _add(self, part: str, kind: Kind, place: str = "", **values: Any) -> None:
@@ -244,12 +251,15 @@ class _ChainAudit:
                         start = said
                     elif good and isinstance(said, Tombstone):
                         tombstones.add((said.of, said.recording))
+                    elif isinstance(said, Tombstone):
+                        self._doubtful[said.of, said.recording] = entry.number
             before = entry.digest
         return start, tombstones
 
     def _holds(self, part: str, envelope: Envelope, claims: Claims) -> bool:
         """Whether the signature is of its key, and the key is trusted; without a trust
-        file, whether it has signed a recording in the folder."""
+        file, whether it has signed a recording in the folder, or the start of a chain
+        that has none left."""
         judged = judge(envelope, claims, self.trust)
         found = judged.differences(self.policy)
         self.differences += [Difference(part, d.kind, d.place, d.stored, d.again) for d in found]
@@ -306,7 +316,14 @@ class _ChainAudit:
             tombstones |= self._said(self._entries(self.folder / chain.NAME))[1]
         for entry in missing:
             if (entry.digest, entry.recording) not in tombstones:
-                self._add(entry.recording or chain.NAME, Kind.REMOVED, again=entry.number)
+                self._add(
+                    entry.recording or chain.NAME, Kind.REMOVED, self._doubt(entry.digest, entry.recording),
+                    again=entry.number,
+                )  # fmt: skip
+
+    def _doubt(self, digest: str, recording: str | None) -> str:
+        """The entry of a tombstone that does not count; empty without one."""
+        return str(self._doubtful.get((digest, recording), ""))
 
     def _inserted(self, entries: Sequence[Entry], signed: Sequence[_Signed]) -> list[Entry]:
         """Signed recordings that no line has. One that continues the chain was closed
@@ -348,8 +365,9 @@ class _ChainAudit:
             except (OSError, NotAnEnvelope):
                 self._add(recording.name, Kind.REMOVED, again="unknown")
                 continue
-            if (chain.digest_of(envelope.payload), said.get("recording")) not in tombstones:
-                self._add(recording.name, Kind.REMOVED, again=number)
+            digest, told = chain.digest_of(envelope.payload), said.get("recording")
+            if (digest, told) not in tombstones:
+                self._add(recording.name, Kind.REMOVED, self._doubt(digest, told), again=number)
 
     # The end.
 

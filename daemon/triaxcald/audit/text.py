@@ -100,6 +100,11 @@ def _what(of: Difference) -> str:
             return f"{place}: {_bare(of.stored)} cannot be, by {_bare(of.again)}: a clock was set back"
         case Kind.MENDED:
             return f"{place}: {stored}, signed by the start that mended the recording, which only vouches for {again}"
+        case Kind.REMOVED if place:
+            return (
+                f"entry {of.again} of the chain is of no recording in the folder, and the signature of its tombstone, "
+                f"entry {place}, does not count"
+            )
         case Kind.REMOVED:
             return f"entry {of.again} of the chain is of no recording in the folder, and no tombstone says why"
         case Kind.INSERTED:
@@ -186,6 +191,8 @@ def chained(of: ChainAudit) -> list[str]:
     """The chain of a folder, in lines."""
     number = tc.number_format.number_of
     told = [f"{number(of.recordings, 'signed recording')}", f"{number(of.tombstones, 'tombstone')}"]
+    if of.doubtful:
+        told.append(f"{of.doubtful} without a signature that counts")
     if of.earlier:
         told.append(f"{of.earlier} from before")
     head = f"; head {of.head[0]}, {of.head[1]}" if of.head else ""

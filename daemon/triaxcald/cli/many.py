@@ -290,6 +290,7 @@ def audit_command(a: argparse.Namespace) -> int:
         return _audit_as_made(a, found, policy)
     if a.output is not None:
         found = many.with_files_beside(found)
+    found = [one for one in found if not _emptied(one, chains)]
     counts: Counter[str] = Counter()
     documents: dict[str, dict[str, Any]] = {}
 
@@ -315,7 +316,7 @@ def audit_command(a: argparse.Namespace) -> int:
         each,
         lambda: text.stopped(counts, len(found)),
     )
-    code = run_job(job, a)
+    code = run_job(job, a) if found or not chains else 0
     if a.json:
         audits = [documents[of.name] for of in found]
         entries = [*map(text.chain_document, chains), *(text.chain_error(of.name, of.error) for of in broken)]
@@ -343,6 +344,13 @@ def _audited_chains(a: argparse.Namespace, policy: Policy) -> tuple[list[ChainAu
         except (DaemonError, td.ProfileError) as e:
             broken.append(Unusable(str(folder), str(e), exit_code_of(e)))
     return chains, broken
+
+
+def _emptied(of: Found, chains: Sequence[ChainAudit]) -> bool:
+    """Whether it is a folder whose recordings were all deleted: its chain tells why."""
+    if not (isinstance(of, Unusable) and of.empty):
+        return False
+    return any(Path(one.folder).resolve().is_relative_to(Path(of.name).resolve()) for one in chains)
 
 
 def _chains(a: argparse.Namespace) -> list[Path]:

@@ -37,11 +37,17 @@ class Source:
 
 @dataclass(frozen=True)
 class Unusable:
-    """What was asked for and names no recording."""
+    """What was asked for and names no recording. ``empty``: a folder that can be read
+    and has none."""
 
     name: str
     error: str
     exit_code: int
+    empty: bool = False
+
+
+class NoRecording(InputError):
+    """A folder without a recording."""
 
 
 Found = Source | Unusable
@@ -70,7 +76,7 @@ def sources_of(
                 if not own or is_url(source.name) or Path(source.name).absolute() not in own:
                     found.setdefault(source.name, source)
         except DaemonError as e:
-            found[given] = Unusable(given, str(e), exit_code_of(e))
+            found[given] = Unusable(given, str(e), exit_code_of(e), isinstance(e, NoRecording))
         except OSError as e:
             found[given] = _unusable(given, e)
     return list(found.values())
@@ -129,7 +135,7 @@ def _in_folder(given: td.files.AnyPath, endings: tuple[str, ...]) -> list[Found]
     if given.is_dir():
         paths, unusable = _below(given, endings)
         if not paths and not unusable:
-            raise InputError(f"{given}: Is a directory, without a recording ({', '.join(endings)}) in it")
+            raise NoRecording(f"{given}: Is a directory, without a recording ({', '.join(endings)}) in it")
         return [*map(_local, paths), *unusable]
     if not given.exists() and _WILD & set(str(given)):
         matches = sorted(map(Path, glob.glob(str(given), recursive=True)))

@@ -583,6 +583,34 @@ def test_a_recording_is_deleted_with_its_tombstone(line: Line, key: SigningKey, 
     assert (found.differences, found.tombstones) == ((), 1)
 
 
+def test_a_folder_whose_recordings_were_all_deleted_has_a_whole_chain(
+    tmp_path: Path, key: SigningKey, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = Line(tmp_path, key)
+    line.record()
+    line.signing.bury(_digest(line, 1), line.made[0].name, "age")
+    removed(line.made[0])
+    assert main(["audit", "--json", str(line.folder)]) == 2
+    capsys.readouterr()
+    assert main(["audit", "--json", "--chain", str(line.folder)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["audits"] == []
+    assert [(of["recordings"], of["tombstones"], of["codes"]) for of in told["chains"]] == [(1, 1, [])]
+    assert main(["audit", "--chain", str(line.folder)]) == 0
+    assert "the chain is whole" in capsys.readouterr().out
+
+
+def test_a_tombstone_whose_key_is_not_trusted_is_told_from_none(line: Line, keys: Keys) -> None:
+    """The file of the recording is gone; the reason is there, but does not count."""
+    _tombstone_forged(line, keys)
+    found = audit_chain(line.folder)
+    gone = next(d for d in found.differences if d.kind is Kind.REMOVED)
+    assert (found.tombstones, found.doubtful, gone.place) == (0, 1, str(len(lines_of(line.folder)) - 1))
+    removed(line.made[3])
+    gone = next(d for d in audit_chain(line.folder).differences if d.part == line.made[3].name)
+    assert (gone.kind, gone.place) == (Kind.REMOVED, "")
+
+
 @pytest.fixture
 def delete(line: Line, key: SigningKey) -> list[str]:
     """The command, of a station that has its key."""
