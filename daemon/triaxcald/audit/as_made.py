@@ -368,7 +368,7 @@ def audit_as_made(
 def _known_there(python: Path, policy: Policy) -> list[str]:
     """The options of the ``policy``, as far as that version has them; one without them
     checks no signature."""
-    options = [] if policy.trust is None else ["--trust", str(policy.trust.absolute())]
+    options = [] if policy.given is None else ["--trust", str(policy.given.absolute())]
     options += ["--allow-unsigned"] if policy.allow_unsigned else []
     if not options:
         return []

@@ -18,7 +18,7 @@ from triaxcald.many import COMMON_AFTER, COMMON_BEFORE, Column, Finding, Found, 
 from triaxcald.many.sources import LIST
 from triaxcald.schema.columns import Kind
 from triaxcald.signing.chain import NAME as CHAIN
-from triaxcald.signing.trust import load_trust, nearest
+from triaxcald.signing.trust import Trust, load_trust, nearest
 from triaxcald.stores import is_url
 
 ENDINGS: Final = (".mcap",)
@@ -61,20 +61,21 @@ def trust_digests(found: Iterable[Found], policy: Policy) -> list[tuple[str, str
     error of that recording alone. Raises InputError, ProfileError for the file that was
     given."""
     if policy.trust is not None:
-        return [("", _trust_digest(policy.trust))]  # wherever it lies
+        trust = policy.trust if isinstance(policy.trust, Trust) else load_trust(policy.trust)
+        return [("", _trust_digest(trust))]  # wherever it lies
     paths = {path.parent: path for of in found if not is_url(of.name) for path in (Path(of.name),)}
     files = {file for path in paths.values() if (file := policy.file_of(path)) is not None}
     digests = []
     for file in sorted(files):
         try:
-            digests.append((str(file), _trust_digest(file)))
+            digests.append((str(file), _trust_digest(load_trust(file))))
         except (DaemonError, td.ProfileError) as e:
             digests.append((str(file), f"unusable: {e}"))
     return digests
 
 
-def _trust_digest(file: Path) -> str:
-    return sha256(load_trust(file).file.model_dump_json().encode()).hexdigest()
+def _trust_digest(trust: Trust) -> str:
+    return sha256(trust.file.model_dump_json().encode()).hexdigest()
 
 
 def with_files_beside(found: Iterable[Found]) -> list[Found]:

@@ -49,25 +49,33 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Policy:
-    """What an audit asks of signatures. ``trust`` is the trust file, by default that
-    of the folder among ``folders`` with the recording, else the nearest one above it;
+    """What an audit asks of signatures. ``trust`` is the trust file, or what it says,
+    for workers that do not have it; by default that of the folder among ``folders``
+    with the recording, else the nearest one above it;
     ``allow_unsigned`` lets recordings pass that are not signed, or not by a trusted
     key. ``folders`` are those that were asked for: a trust file further below, where
     an audit was not asked to look for one, does not count."""
 
-    trust: Path | None = None
+    trust: Path | Trust | None = None
     allow_unsigned: bool = False
     folders: tuple[Path, ...] = ()
+
+    @property
+    def given(self) -> Path | None:
+        """Path of the trust file that was given."""
+        return self.trust.path if isinstance(self.trust, Trust) else self.trust
 
     def trust_of(self, recording: td.files.AnyPath) -> Trust | None:
         """In a store only the file that was given counts. Raises InputError; Rejected
         where the nearest one may be a stranger's."""
+        if isinstance(self.trust, Trust):
+            return self.trust
         path = self.file_of(recording)
         return None if path is None else load_trust(path)
 
     def file_of(self, recording: td.files.AnyPath) -> Path | None:
         if self.trust is not None or not isinstance(recording, Path):
-            return self.trust
+            return self.given
         parent = recording.parent.resolve()
         for folder in self.folders:
             if parent.is_relative_to(folder.resolve()) and (found := nearest(folder, TRUST_FILE)) is not None:

@@ -279,10 +279,11 @@ def said_options(options: dict[str, Any]) -> str:
 
 def audit_command(a: argparse.Namespace) -> int:
     from triaxcald.audit import Policy, many, text  # the whole line, which no other command needs
+    from triaxcald.signing.trust import load_trust
 
     _require_agreeing(a)
-    elsewhere = a.scheduler is not None  # workers start from another folder
-    trust = a.trust.absolute() if elsewhere and a.trust is not None else a.trust
+    elsewhere = a.scheduler is not None  # workers start from another folder, and may not have the trust file
+    trust = load_trust(a.trust.absolute()) if elsewhere and a.trust is not None else a.trust
     policy = Policy(trust, a.allow_unsigned, tuple(Path(r).resolve() for r in a.recordings if os.path.isdir(r)))
     chains, broken = _audited_chains(a, policy)
     found = sources_of(a.recordings, many.ENDINGS, without=own_files(a), lists=many.MANIFESTS, absolute=elsewhere)

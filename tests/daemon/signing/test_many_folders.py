@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 
 import pytest
 
 from tests.daemon.signing.conftest import trusted
 from tests.daemon.signing.line import Line
-from triaxcald.audit import Policy
+from triaxcald.audit import Policy, many
 from triaxcald.audit.as_made import unproven
 from triaxcald.cli.commands import main
 from triaxcald.signing.keys import SigningKey
+from triaxcald.signing.trust import load_trust
 
 
 def test_a_folder_without_a_chain_hides_no_other(
@@ -44,6 +46,19 @@ def test_signatures_are_judged_by_the_policy_before_earlier_versions_run(
     assert broken.exit_code == 2
     assert len(signed) == 4
     assert earlier.name == "earlier.mcap"
+
+
+def test_a_trust_file_that_was_read_judges_where_it_is_not(
+    recorded: Line, tmp_path: Path, keys: dict[str, SigningKey]
+) -> None:
+    """As on a worker of a cluster."""
+    file = trusted(tmp_path, "2020-01-01T00:00:00+00:00", keys["stranger"])
+    sent = pickle.loads(pickle.dumps(Policy(load_trust(file))))
+    file.unlink()
+    assert {one.name for one in unproven(recorded.made, sent)} == {str(path) for path in recorded.made}
+    assert many.trust_digests([], sent) == many.trust_digests(
+        [], Policy(trusted(tmp_path, "2020-01-01T00:00:00+00:00", keys["stranger"]))
+    )
 
 
 def test_a_trust_file_planted_below_the_folder_does_not_count(
