@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
@@ -133,20 +134,24 @@ def _stored(of: Listed) -> Source:
 def _in_folder(given: td.files.AnyPath, endings: tuple[str, ...]) -> list[Found]:
     assert isinstance(given, Path)
     if given.is_dir():
-        paths, unusable = _below(given, endings)
-        if not paths and not unusable:
+        found = _recordings_of(given, endings)
+        if not found:
             raise NoRecording(f"{given}: Is a directory, without a recording ({', '.join(endings)}) in it")
-        return [*map(_local, paths), *unusable]
+        return found
     if not given.exists() and _WILD & set(str(given)):
         matches = sorted(map(Path, glob.glob(str(given), recursive=True)))
-        if not matches:
+        closed: list[Found] = [_closed(e) for e in _not_searched(given)]
+        if not matches and not closed:
             raise InputError(f"{given}: no file has a name like this")
-        return [s for of in matches for s in (_in_folder(of, endings) if of.is_dir() else [_local(of)])]
+        found = [s for of in matches for s in (_recordings_of(of, endings) if of.is_dir() else [_local(of)])] + closed
+        if not found:
+            raise NoRecording(f"{given}: folders without a recording ({', '.join(endings)}) in them")
+        return found
     return [_local(given)]
 
 
-def _below(folder: Path, endings: tuple[str, ...]) -> tuple[list[Path], list[Unusable]]:
-    """Recordings in order, and folders that cannot be looked into."""
+def _recordings_of(folder: Path, endings: tuple[str, ...]) -> list[Found]:
+    """Recordings below a folder in order, and folders that cannot be looked into."""
     errors: list[OSError] = []
     paths = sorted(
         Path(within, name)
@@ -156,7 +161,53 @@ def _below(folder: Path, endings: tuple[str, ...]) -> tuple[list[Path], list[Unu
     )
     if MANIFEST in endings:
         paths = _without_segments(paths)
-    return paths, [_unusable(str(e.filename), e, "cannot be looked into: ") for e in errors]
+    return [*map(_local, paths), *map(_closed, errors)]
+
+
+def _closed(e: OSError) -> Unusable:
+    """A folder that cannot be looked into."""
+    return _unusable(str(e.filename), e, "cannot be looked into: ")
+
+
+def _not_searched(pattern: Path) -> list[OSError]:
+    """Folders that the pattern leads to and that cannot be read; `glob` passes over
+    them without a word."""
+    errors: dict[str, OSError] = {}
+    seen: set[tuple[str, int]] = set()
+
+    def search(folder: str, first: int) -> None:
+        while first < len(pattern.parts) - 1 and not _WILD & set(pattern.parts[first]):
+            folder, first = os.path.join(folder, pattern.parts[first]), first + 1
+        if first == len(pattern.parts) or (folder, first) in seen:
+            return
+        seen.add((folder, first))
+        part = pattern.parts[first]
+        try:
+            if not _WILD & set(part):  # the last one: a name that is looked up
+                os.lstat(os.path.join(folder, part))
+                return
+            with os.scandir(folder or ".") as entries:
+                # ** goes down any number of folders; links may form circles.
+                below = sorted(
+                    e.path for e in entries if e.is_dir(follow_symlinks=part != "**") and _fits(e.name, part)
+                )
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        except OSError as e:
+            errors[folder] = e
+            return
+        if part == "**":
+            search(folder, first + 1)
+        for path in below:
+            search(path, first if part == "**" else first + 1)
+
+    search("", 0)
+    return list(errors.values())
+
+
+def _fits(name: str, part: str) -> bool:
+    hidden = name.startswith(".") and not part.startswith(".")
+    return not hidden and (part == "**" or fnmatchcase(name, part))
 
 
 def _without_segments(paths: list[Path]) -> list[Path]:

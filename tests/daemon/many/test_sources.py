@@ -97,7 +97,8 @@ def test_a_url_that_is_none_is_an_error_of_its_own(folder: Path) -> None:
     assert isinstance(good, Source)
 
 
-def test_a_folder_that_cannot_be_looked_into_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def below_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Root may look into every folder, so the system's answer is put in."""
     true = os.scandir
 
@@ -107,6 +108,45 @@ def test_a_folder_that_cannot_be_looked_into_is_named(folder: Path, monkeypatch:
         return true(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
+
+
+@pytest.mark.usefixtures("below_is_closed")
+@pytest.mark.parametrize(
+    ("pattern", "names", "closed"),
+    [
+        ("**/*.mcap", ["a.mcap", "b.mcap"], True),
+        ("**", ["a.mcap", "b.mcap"], True),
+        ("*", ["a.mcap", "b.mcap"], True),
+        ("*/c.mcap", ["c.mcap"], False),
+        ("below/*.mcap", [], True),
+        ("b*/c.mcap", ["c.mcap"], False),
+        ("[ab].mcap", ["a.mcap", "b.mcap"], False),
+        ("a*/c.mcap", [], False),
+        ("*/*/c.mcap", [], True),
+    ],
+)
+def test_a_pattern_names_the_folders_that_it_cannot_look_into(
+    folder: Path, pattern: str, names: list[str], closed: bool
+) -> None:
+    found = sources_of([f"{folder}/{pattern}"], MCAP)
+    assert [Path(of.name).name for of in found if of.name.endswith(".mcap") and isinstance(of, Source)] == names
+    told = [of.error for of in found if isinstance(of, Unusable)]
+    if closed:
+        assert told == [f"{folder / 'below'}: cannot be looked into: {os.strerror(errno.EACCES)}"]
+    else:
+        assert not any("cannot be looked into" in error for error in told)
+
+
+def test_an_empty_folder_hides_no_other_of_a_pattern(folder: Path) -> None:
+    (folder / "empty").mkdir()
+    assert names([str(folder / "[be]*[wy]")]) == ["c.mcap"]
+    [none] = sources_of([str(folder / "empt*")], MCAP)
+    assert isinstance(none, Unusable)
+    assert none.exit_code == 2
+
+
+@pytest.mark.usefixtures("below_is_closed")
+def test_a_folder_that_cannot_be_looked_into_is_named(folder: Path) -> None:
     *found, closed = sources_of([str(folder)], MCAP)
     assert [Path(of.name).name for of in found] == ["a.mcap", "b.mcap"]
     assert closed == Unusable(
