@@ -27,6 +27,7 @@ def describe(path: Path, *, count: bool = False) -> dict[str, Any]:
     with open_recording(path, unfinished=True, alike=False) as recording:
         index = None if count or not is_long(recording) else recording.index()
         topics = _topics(recording) if index is None else _counted(index.topics)
+        raw = _phases(recording) if index is None else _timed(_counted(index.phases))
         events = list(recording.events())
         starts = [topic["start_ns"] for topic in topics.values()]
         ends = [topic["end_ns"] for topic in topics.values()]
@@ -37,11 +38,11 @@ def describe(path: Path, *, count: bool = False) -> dict[str, Any]:
             **(_segments(recording) if isinstance(recording, Series) else _file(recording)),
             "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
             "topics": topics,
-            "raw": _phases(recording) if index is None else _timed(_counted(index.phases)),
+            "raw": raw,
             "counted": index is None,
             **_imported(events),
             "ended": next((_detail(e) for e in reversed(events) if e.kind == ENDED), None),
-            **({"bus": describe_bus(recording)} if is_of_bus(recording) else {}),
+            **({"bus": describe_bus(recording, None if index is None else raw)} if is_of_bus(recording) else {}),
             "metadata": recording.metadata,
             "attachments": {
                 name: {

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcald.recording import schema
 from triaxcald.recording.bus import Channel, bus_frames, bus_record, channel_of, frame_rows, phase_of
+from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
@@ -82,6 +83,20 @@ def test_its_frames_come_one_by_one_for_whoever_imports_them(bus_recording: Path
 def test_a_channel_is_told_apart_by_its_phase(channel: Channel, phase: str) -> None:
     assert phase_of(channel) == phase
     assert channel_of(phase) == channel
+
+
+def test_info_of_a_long_bus_recording_reads_no_frame(bus_recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = describe(bus_recording)
+    monkeypatch.setattr("triaxcald.recording.info.COUNTED_MOST", 5)
+    monkeypatch.setattr(Recording, "joined_batches", lambda _: pytest.fail("it reads frames"))
+    found = describe(bus_recording)
+    assert (found["counted"], found["raw"], found["bus"]["lost"]) == (False, counted["raw"], counted["bus"]["lost"])
+    for name, channel in found["bus"]["channels"].items():
+        of = counted["bus"]["channels"][name]
+        assert channel == {
+            "records": of["frames"] + of["errors"], **{key: of[key] for key in ("start_ns", "end_ns", "duration_s")}
+        }  # fmt: skip
+    assert set(found["bus"]["channels"]) == {"chassis", "1"}
 
 
 def test_info_says_what_came_on_which_channel(bus_recording: Path, triaxcal: Callable[..., Any]) -> None:
