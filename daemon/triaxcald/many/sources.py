@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from errno import ELOOP
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
@@ -140,7 +141,7 @@ def _in_folder(given: td.files.AnyPath, endings: tuple[str, ...]) -> list[Found]
         return found
     if not given.exists() and _WILD & set(str(given)):
         matches = sorted(map(Path, glob.glob(str(given), recursive=True)))
-        closed: list[Found] = [_closed(e) for e in _not_searched(given)]
+        closed: list[Found] = list(_not_searched(given))
         if not matches and not closed:
             raise InputError(f"{given}: no file has a name like this")
         found = [s for of in matches for s in (_recordings_of(of, endings) if of.is_dir() else [_local(of)])] + closed
@@ -164,45 +165,51 @@ def _recordings_of(folder: Path, endings: tuple[str, ...]) -> list[Found]:
     return [*map(_local, paths), *map(_closed, errors)]
 
 
-def _closed(e: OSError) -> Unusable:
+def _closed(e: OSError, path: str | None = None) -> Unusable:
     """A folder that cannot be looked into."""
-    return _unusable(str(e.filename), e, "cannot be looked into: ")
+    return _unusable(str(e.filename) if path is None else path, e, "cannot be looked into: ")
 
 
-def _not_searched(pattern: Path) -> list[OSError]:
+def _not_searched(pattern: Path) -> list[Unusable]:
     """Folders that the pattern leads to and that cannot be read; `glob` passes over
     them without a word."""
     errors: dict[str, OSError] = {}
-    seen: set[tuple[str, int]] = set()
+    seen: set[tuple[str, int]] = set()  # links may form circles
 
     def search(folder: str, first: int) -> None:
         while first < len(pattern.parts) - 1 and not _WILD & set(pattern.parts[first]):
             folder, first = os.path.join(folder, pattern.parts[first]), first + 1
-        if first == len(pattern.parts) or (folder, first) in seen:
+        if first == len(pattern.parts) or (real := (os.path.realpath(folder), first)) in seen:
             return
-        seen.add((folder, first))
-        part = pattern.parts[first]
+        seen.add(real)
+        part, last = pattern.parts[first], first == len(pattern.parts) - 1
+        below: list[str] = []
         try:
-            if not _WILD & set(part):  # the last one: a name that is looked up
+            if not _WILD & set(part):  # a name that is looked up
                 os.lstat(os.path.join(folder, part))
                 return
             with os.scandir(folder or ".") as entries:
-                # ** goes down any number of folders; links may form circles.
-                below = sorted(
-                    e.path for e in entries if e.is_dir(follow_symlinks=part != "**") and _fits(e.name, part)
-                )
-        except (FileNotFoundError, NotADirectoryError):
-            return
+                # What the last part matches is looked into by who opens it.
+                fitting = [e for e in entries if _fits(e.name, part)] if part == "**" or not last else []
         except OSError as e:
-            errors[folder] = e
+            if not isinstance(e, (FileNotFoundError, NotADirectoryError)):
+                errors[folder] = e
             return
+        for entry in fitting:
+            path = os.path.join(folder, entry.name)
+            try:
+                if entry.is_dir():
+                    below.append(path)
+            except OSError as e:
+                if e.errno != ELOOP:  # a link to itself is no folder
+                    errors[path] = e
         if part == "**":
             search(folder, first + 1)
-        for path in below:
+        for path in sorted(below):
             search(path, first if part == "**" else first + 1)
 
     search("", 0)
-    return list(errors.values())
+    return [_closed(e, path or ".") for path, e in errors.items()]
 
 
 def _fits(name: str, part: str) -> bool:

@@ -102,8 +102,8 @@ def below_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Root may look into every folder, so the system's answer is put in."""
     true = os.scandir
 
-    def scandir(path: str) -> Any:
-        if Path(path).name == "below":
+    def scandir(path: str = ".") -> Any:
+        if Path(path).resolve().name == "below":
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
         return true(path)
 
@@ -135,6 +135,31 @@ def test_a_pattern_names_the_folders_that_it_cannot_look_into(
         assert told == [f"{folder / 'below'}: cannot be looked into: {os.strerror(errno.EACCES)}"]
     else:
         assert not any("cannot be looked into" in error for error in told)
+
+
+@pytest.mark.usefixtures("below_is_closed")
+@pytest.mark.parametrize("pattern", ["**/*.mcap", "link/*.mcap", "li*/*.mcap", "**/link/**"])
+def test_a_closed_folder_behind_a_link_is_named(folder: Path, pattern: str) -> None:
+    (folder / "link").symlink_to(folder / "below")
+    told = [of.name for of in sources_of([f"{folder}/{pattern}"], MCAP) if isinstance(of, Unusable)]
+    assert str(folder / "link") in told or str(folder / "below") in told
+    assert len(told) == len(set(told))
+
+
+@pytest.mark.usefixtures("below_is_closed")
+def test_a_relative_pattern_names_a_closed_folder_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    for pattern in ("**", "*", "**/*.mcap", "be*/*.mcap"):
+        assert [of.name for of in sources_of([pattern], MCAP) if isinstance(of, Unusable)] == ["below"]
+
+
+def test_links_that_go_round_and_fit_nothing_are_no_errors(folder: Path) -> None:
+    (folder / "self").symlink_to(folder / "self")
+    (folder / "below" / "up").symlink_to(folder)
+    for pattern in ("*/c.mcap", "b*/c.mcap", "b*/*.mcap", "**/c.mcap"):
+        found = sources_of([f"{folder}/{pattern}"], MCAP)
+        assert found
+        assert all(isinstance(of, Source) for of in found)
 
 
 def test_an_empty_folder_hides_no_other_of_a_pattern(folder: Path) -> None:
