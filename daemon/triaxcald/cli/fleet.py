@@ -38,6 +38,7 @@ def fleet_command(a: argparse.Namespace) -> int:
     runs = read_runs(a.source, Selection(since_us, until_us, equal), _reading)
     fleets = fleets_of(runs)
     if not fleets and a.output is not None:
+        _say_skipped(a.source, runs.skipped)
         raise _nothing_measured(a.source, told)
     at("statistics")
     asked = Asked(a.limit, a.probability, told)
@@ -59,12 +60,16 @@ def fleet_command(a: argparse.Namespace) -> int:
         emit(document)
     else:
         _show(document)
-    if runs.skipped:
-        more = f" and {len(runs.skipped) - NAMED_MOST} more" if len(runs.skipped) > NAMED_MOST else ""
-        say(f"{_shown(a.source)}: left out, not readable: {', '.join(runs.skipped[:NAMED_MOST])}{more}")
+    _say_skipped(a.source, runs.skipped)
     if not fleets:
         raise _nothing_measured(a.source, told)
     return 0
+
+
+def _say_skipped(source: str, skipped: Sequence[str]) -> None:
+    if skipped:
+        more = f" and {len(skipped) - NAMED_MOST} more" if len(skipped) > NAMED_MOST else ""
+        say(f"{_shown(source)}: left out, not readable: {', '.join(skipped[:NAMED_MOST])}{more}")
 
 
 def _nothing_measured(source: str, chosen: Mapping[str, str]) -> InputError:
