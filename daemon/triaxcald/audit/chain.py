@@ -41,6 +41,9 @@ class ChainAudit:
     head: tuple[int, str] | None = None
     doubtful: int = 0
     """Tombstones whose signature does not hold, or is of a key that is not trusted."""
+    emptied: bool = False
+    """Trusted tombstones tell of every recording that was in the folder: it has none
+    left, and had none before the chain."""
 
     @property
     def exit_code(self) -> int:
@@ -157,8 +160,6 @@ class _ChainAudit:
             return ChainAudit(str(self.folder), tuple(self.differences))
         entries = entries or self._entries(path)
         self._keys = {one.envelope.key_id for one in signed}
-        if not signed:  # all were deleted: nothing but the chain's start names a key
-            self._keys = {e.envelope.key_id for e in entries[:1] if e.envelope is not None}
         start, tombstones = self._said(entries)
         doubtful = len(self._doubtful)
         self._linked(entries, signed)
@@ -168,6 +169,7 @@ class _ChainAudit:
         self._sidecars(tombstones)
         entries += extra
         self._cut(entries)
+        known = self.trust is not None and start is not None and not start.earlier
         return ChainAudit(
             str(self.folder),
             tuple(dict.fromkeys(self.differences)),
@@ -176,6 +178,7 @@ class _ChainAudit:
             earlier,
             (entries[-1].number, entries[-1].digest) if entries else None,
             doubtful,
+            known and bool(tombstones) and not (signed or unsigned or self.differences),
         )
 
     def _add(self, part: str, kind: Kind, place: str = "", **values: Any) -> None:
@@ -258,8 +261,7 @@ class _ChainAudit:
 
     def _holds(self, part: str, envelope: Envelope, claims: Claims) -> bool:
         """Whether the signature is of its key, and the key is trusted; without a trust
-        file, whether it has signed a recording in the folder, or the start of a chain
-        that has none left."""
+        file, whether it has signed a recording in the folder."""
         judged = judge(envelope, claims, self.trust)
         found = judged.differences(self.policy)
         self.differences += [Difference(part, d.kind, d.place, d.stored, d.again) for d in found]
@@ -366,8 +368,9 @@ class _ChainAudit:
                 self._add(recording.name, Kind.REMOVED, again="unknown")
                 continue
             digest, told = chain.digest_of(envelope.payload), said.get("recording")
-            if (digest, told) not in tombstones:
-                self._add(recording.name, Kind.REMOVED, self._doubt(digest, told), again=number)
+            name = told if isinstance(told, str) else None
+            if (digest, name) not in tombstones:
+                self._add(recording.name, Kind.REMOVED, self._doubt(digest, name), again=number)
 
     # The end.
 

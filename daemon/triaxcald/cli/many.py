@@ -74,12 +74,14 @@ class Job:
     stopped: Callable[[], str]
     is_whole: Callable[[Row], bool] = lambda row: True
     refusal: Callable[[Source, Row | None], str | None] = lambda source, row: None
+    may_be_none: bool = False
+    """Whether no recording at all is no error."""
 
 
 def run_job(job: Job, a: argparse.Namespace) -> int:
     """The worst exit code of all. Raises InputError, also where there is no recording,
     DiskError, StationError."""
-    if not job.found:
+    if not job.found and not job.may_be_none:
         raise InputError(f"{', '.join(a.recordings)}: no recording is left to work at")
     processes = _processes(a, len(job.found))
     if processes is not None and a.memory is not None and a.memory < MEMORY_LEAST:
@@ -291,7 +293,8 @@ def audit_command(a: argparse.Namespace) -> int:
         return _audit_as_made(a, found, policy)
     if a.output is not None:
         found = many.with_files_beside(found)
-    found = [one for one in found if not _emptied(one, chains)]
+    left = [one for one in found if not _emptied(one, chains)]
+    emptied, found = len(left) < len(found), left
     counts: Counter[str] = Counter()
     documents: dict[str, dict[str, Any]] = {}
 
@@ -316,8 +319,9 @@ def audit_command(a: argparse.Namespace) -> int:
         found,
         each,
         lambda: text.stopped(counts, len(found)),
+        may_be_none=emptied,
     )
-    code = run_job(job, a) if found or not chains else 0
+    code = run_job(job, a)
     if a.json:
         audits = [documents[of.name] for of in found]
         entries = [*map(text.chain_document, chains), *(text.chain_error(of.name, of.error) for of in broken)]
@@ -348,10 +352,11 @@ def _audited_chains(a: argparse.Namespace, policy: Policy) -> tuple[list[ChainAu
 
 
 def _emptied(of: Found, chains: Sequence[ChainAudit]) -> bool:
-    """Whether it is a folder whose recordings were all deleted: its chain tells why."""
+    """Whether it is a folder whose recordings were all deleted, as its own chain
+    proves."""
     if not (isinstance(of, Unusable) and of.empty):
         return False
-    return any(Path(one.folder).resolve().is_relative_to(Path(of.name).resolve()) for one in chains)
+    return any(one.emptied and Path(one.folder).resolve() == Path(of.name).resolve() for one in chains)
 
 
 def _chains(a: argparse.Namespace) -> list[Path]:
