@@ -161,7 +161,6 @@ class _ChainAudit:
         entries = entries or self._entries(path)
         self._keys = {one.envelope.key_id for one in signed}
         start, tombstones = self._said(entries)
-        doubtful = len(self._doubtful)
         self._linked(entries, signed)
         self._removed(entries, tombstones, signed)
         extra = self._inserted(entries, signed)
@@ -177,7 +176,7 @@ class _ChainAudit:
             len(tombstones),
             earlier,
             (entries[-1].number, entries[-1].digest) if entries else None,
-            doubtful,
+            len(self._doubtful),
             known and bool(tombstones) and not (signed or unsigned or self.differences),
         )
 

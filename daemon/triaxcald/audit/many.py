@@ -60,8 +60,9 @@ def trust_digests(found: Iterable[Found], policy: Policy) -> list[tuple[str, str
     another one is done again. One that lies above a recording and cannot be used is an
     error of that recording alone. Raises InputError, ProfileError for the file that was
     given."""
-    if policy.trust is not None:
-        trust = policy.trust if isinstance(policy.trust, Trust) else load_trust(policy.trust)
+    if policy.given is not None:
+        trust = policy.trust_of(policy.given)
+        assert trust is not None
         return [("", _trust_digest(trust))]  # wherever it lies
     paths = {path.parent: path for of in found if not is_url(of.name) for path in (Path(of.name),)}
     files = {file for path in paths.values() if (file := policy.file_of(path)) is not None}

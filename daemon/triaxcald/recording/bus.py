@@ -99,23 +99,26 @@ def describe_bus(recording: Contents, counted: Mapping[str, Mapping[str, Any]] |
     channels; ``gaps`` of a channel are the places where its receiver lost
     some. Where ``counted`` has the numbers of each phase, no frame is read, and a
     channel has these. Raises RecordingError."""
-    channels: dict[str, Any] = {}
-    if counted is None:
-        read: dict[str, _Channel] = {}
-        for phase, batch in recording.joined_batches():
-            if phase.startswith(BUS_PHASE) and len(batch):
-                read.setdefault(phase.removeprefix(BUS_PHASE), _Channel()).feed(batch)
-        channels = {name: channel.document() for name, channel in read.items()}
-    else:
-        channels = {
-            phase.removeprefix(BUS_PHASE): {key: found[key] for key in ("records", "start_ns", "end_ns", "duration_s")}
-            for phase, found in counted.items()
-            if phase.startswith(BUS_PHASE)
-        }
     return {
         **recording.metadata.get(BUS_RECORD, {}),
-        "channels": channels,
+        "channels": _read_channels(recording) if counted is None else _counted_channels(counted),
         "lost": sum(loss.records for loss in recording.losses() if loss.where == RAW),
+    }
+
+
+def _read_channels(recording: Contents) -> dict[str, dict[str, Any]]:
+    channels: dict[str, _Channel] = {}
+    for phase, batch in recording.joined_batches():
+        if phase.startswith(BUS_PHASE) and len(batch):
+            channels.setdefault(phase.removeprefix(BUS_PHASE), _Channel()).feed(batch)
+    return {name: channel.document() for name, channel in channels.items()}
+
+
+def _counted_channels(phases: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {
+        phase.removeprefix(BUS_PHASE): {key: found[key] for key in ("records", "start_ns", "end_ns", "duration_s")}
+        for phase, found in phases.items()
+        if phase.startswith(BUS_PHASE)
     }
 
 
