@@ -14,13 +14,15 @@ import triaxcal as tc
 import triaxcal_drivers as td
 from triaxcald.errors import InputError
 from triaxcald.fleet.reading import Certified, Row
+from triaxcald.fleet.recorded import Recorded, recorded_in
 from triaxcald.fleet.values import Fleet
 from triaxcald.inputs import DOCUMENT_MOST, parse_document
 from triaxcald.service.quality import COEFFICIENTS
 
 WHOLE_MOST: Final = 2000
-"""Runs of which certificates are read whole, with their poses: more take minutes. Of
-larger fleets the coefficients and effects count, without poses."""
+"""Runs of which certificates are read whole, with their poses, and recordings opened:
+more take minutes. Of larger fleets the coefficients and effects count, without
+poses."""
 FACTORS: Final = ("part_number", "batch", "station", "fixture", "slot", "operator")
 Tell = Callable[[int, int], None]
 
@@ -105,11 +107,13 @@ def _runs(fleet: Fleet, folder: Path | None, tell: Tell) -> list[tc.population.U
     for i, (row, paper) in enumerate(zip(fleet.rows, fleet.certified, strict=True)):
         tell(i, len(fleet.rows))
         document = _document(folder, row) if whole and paper is not None else None
-        found.append(_run(fleet, i, paper, document))
+        found.append(_run(fleet, i, paper, document, folder))
     return found
 
 
-def _run(fleet: Fleet, i: int, paper: Certified | None, document: Any | None) -> tc.population.UnitRun | None:
+def _run(
+    fleet: Fleet, i: int, paper: Certified | None, document: Any | None, folder: Path | None
+) -> tc.population.UnitRun | None:
     """None of a run without nine coefficients, or of an unknown unit."""
     row = fleet.rows[i]
     if fleet.unit[i] < 0:
@@ -118,10 +122,12 @@ def _run(fleet: Fleet, i: int, paper: Certified | None, document: Any | None) ->
     at = datetime.fromtimestamp(time_s, UTC)
     places = {name: row[name] for name in FACTORS} | {"hour": at.hour + at.minute / 60}
     if document is not None:
+        beside = _recorded(folder, row)
         try:
             return tc.interchange.unit_run_in(
-                document, serial=serial, time_s=time_s, where=str(row["certificate"]), **places
-            )
+                document, serial=serial, time_s=time_s, where=str(row["certificate"]),
+                mounting=beside.mounting, resolution=beside.resolution, **places,
+            )  # fmt: skip
         except tc.InvalidData:
             pass  # a certificate that states no such figures; the outcome may
     values = np.array([np.nan if row[name] is None else row[name] for name in COEFFICIENTS], dtype=float)
@@ -155,6 +161,12 @@ def _document(folder: Path | None, row: Row) -> dict[str, Any] | None:
         return dict(parse_document(td.files.read_whole(path, DOCUMENT_MOST), where=str(path)))
     except (OSError, td.files.TooLarge, InputError):
         return None
+
+
+def _recorded(folder: Path | None, row: Row) -> Recorded:
+    if folder is None or row["recording"] is None:
+        return Recorded()
+    return recorded_in(folder / Path(row["recording"]).name, row["slot"])
 
 
 # Odds.
