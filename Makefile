@@ -35,7 +35,7 @@ demo: $(READY)  ## the whole line on two simulated units
 
 # Two processes more than processors: some tests wait for a bus, and others work meanwhile.
 WORKERS = $(shell $(BIN)/python -c 'import os; print(min(os.cpu_count(), 8) + 2)')
-PYTEST = $(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+PYTEST = $(ONE_THREAD) $(BIN)/python -m pytest -q --instafail -n $(WORKERS) --dist worksteal
 test: $(TOOLS)  ## the tests, in some minutes
 	@echo "Testing: some four minutes on two cores; make test-slow runs the rest"
 	$(PYTEST) -m "not slow"

@@ -45,7 +45,7 @@ def test_a_recorder_loads_nothing_that_draws() -> None:
         "import triaxcald.service.supervisor\n"
         "sys.exit('matplotlib' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=180).returncode == 0
 
 
 def test_the_container_starts_the_same_command(unit: configparser.ConfigParser) -> None:
@@ -82,7 +82,7 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
         pytest.skip("this machine has no systemd-analyze")
     text = UNIT.read_text().replace("/opt/triaxcal/bin/triaxcal", "/bin/true").replace("User=triaxcal", "User=root")
     (tmp_path / UNIT.name).write_text(text)
-    done = subprocess.run([systemd, "verify", str(tmp_path / UNIT.name)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([systemd, "verify", str(tmp_path / UNIT.name)], capture_output=True, text=True, timeout=180)
     about_it = [line for line in done.stderr.splitlines() if UNIT.name in line]
     assert about_it == []
 
@@ -96,7 +96,7 @@ def test_a_reload_is_the_signal_that_the_command_takes_for_one_and_needs_no_othe
             assert recorder.stdout is not None
             recorder.stdout.readline()
             without_programs = {"MAINPID": str(recorder.pid), "PATH": str(tmp_path)}
-            subprocess.run(shlex.split(unit["Service"]["ExecReload"]), env=without_programs, check=True, timeout=60)
+            subprocess.run(shlex.split(unit["Service"]["ExecReload"]), env=without_programs, check=True, timeout=180)
             assert recorder.wait(60) == -signal.SIGHUP
         finally:
             recorder.kill()

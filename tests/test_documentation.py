@@ -246,7 +246,7 @@ def run(command: str) -> int:
     if len(calls) == 1 and not OPERATORS & set(shlex.split(command)) and command.startswith("triaxcal "):
         return main(calls[0])
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return subprocess.run(["bash", "-c", command], env=os.environ | {"PATH": path}, check=False, timeout=60).returncode
+    return subprocess.run(["bash", "-c", command], env=os.environ | {"PATH": path}, check=False, timeout=180).returncode
 
 
 def subcommands(top: argparse.ArgumentParser, prefix: str = "") -> dict[str, argparse.ArgumentParser]:
@@ -367,7 +367,7 @@ print({k: v for k, v in pipeline.counts.items() if v})
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
     )
     assert done.returncode == 0, done.stderr
     decoded, counts = done.stdout.splitlines()

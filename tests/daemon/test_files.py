@@ -54,7 +54,7 @@ def test_a_pipe_is_written_to_and_stays_a_pipe(tmp_path: Path) -> None:
     reader.start()
     write_text(path, "through")
     assert stat.S_ISFIFO(path.stat().st_mode)
-    reader.join(timeout=10)
+    reader.join(timeout=180)
     assert read == ["through"]
 
 

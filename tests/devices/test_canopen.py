@@ -18,7 +18,7 @@ from tests.devices.sdo import SdoServer
 
 READ_SERIAL, SERIAL = "40 18 10 04 00 00 00 00", "43 18 10 04 67 12 00 00"
 RESET = "2B 10 2F 02 53 52 00 00"
-PATIENCE_S = 10.0
+PATIENCE_S = 180.0
 
 
 class Master:

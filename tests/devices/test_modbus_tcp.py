@@ -21,7 +21,7 @@ RESET = "0000 0006 01 06 0024 5253"
 
 class Master:
     def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=10)
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=180)
 
     def send(self, *frames: str) -> None:
         self._socket.sendall(bytes.fromhex("".join(frames)))

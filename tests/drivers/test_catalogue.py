@@ -55,7 +55,7 @@ def elsewhere(tmp_path: Path):
             capture_output=True,
             text=True,
             check=True,
-            timeout=30,
+            timeout=180,
         ).stdout
 
     install.python = python

@@ -50,7 +50,7 @@ def triaxcal_beside(tmp_path: Path) -> Listing:
             env=os.environ | {"PYTHONPATH": path},
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=180,
             cwd=tmp_path,
         )
 

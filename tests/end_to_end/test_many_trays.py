@@ -499,7 +499,7 @@ def test_a_disk_that_fails_in_a_recording_leaves_a_folder_that_can_be_audited(
     with workshop.serve(workshop.device(serial=1003, **LIVE)) as served:
         station = live_station(workshop, served)
         done = subprocess.run(
-            [PROGRAM, "run", station, "--events"], capture_output=True, text=True, timeout=120, check=False,
+            [PROGRAM, "run", station, "--events"], capture_output=True, text=True, timeout=180, check=False,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_MOST, FILE_MOST)),
         )  # fmt: skip
         (outcome,) = ended_in(lines_of(done.stdout))

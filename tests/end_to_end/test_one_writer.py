@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 Run = Callable[..., Any]
-DEADLINE_S = 120.0
+DEADLINE_S = 180.0
 CAL = {
     "format": "triaxcal.calibration/1",
     "scale_factor": [-2.41, -2.405, -2.37],

@@ -42,7 +42,7 @@ class Line(Served):
     def put(self, work: dict[str, str]) -> None:
         head = {"Content-Type": "application/json"}
         url = f"http://127.0.0.1:{self.port}/api/1/tray"
-        with urlopen(Request(url, json.dumps(work).encode(), head, method="PUT"), timeout=30) as answer:
+        with urlopen(Request(url, json.dumps(work).encode(), head, method="PUT"), timeout=180) as answer:
             answer.read()
 
     def recorded(self) -> int:
@@ -99,7 +99,7 @@ def test_each_end_of_a_run_has_its_page(
         assert ("report" in found) == (code in ("within_limits", "fit_outside"))
         expect(page.locator(".lacking")).to_have_count(0 if set(found) == set(FILES) else 1)
         expect(page.locator(f".banner.{run['verdict']}")).to_contain_text(run["reason"])
-        expect(page.locator("figure .chart path")).to_have_count(3, timeout=60000)
+        expect(page.locator("figure .chart path")).to_have_count(3)
         expect(page.locator("section", has_text="Events").locator("tr").last).to_contain_text("Ended")
         expect(page.locator(".facts")).to_contain_text(run["work_reason"])
     page.goto(f"{url}/units/{SERIAL}")

@@ -47,7 +47,7 @@ class Served:
     def ask(self, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
         request = Request(f"http://127.0.0.1:{self.port}{path}", data, {"Content-Type": "application/json"})
-        with urlopen(request, timeout=30) as answer:
+        with urlopen(request, timeout=180) as answer:
             return json.loads(answer.read())
 
     def slots(self) -> dict[str, dict[str, Any]]:

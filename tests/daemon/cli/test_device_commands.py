@@ -428,7 +428,7 @@ def test_devices_says_what_is_wrong_with_somebody_elses_broken_driver(tmp_path: 
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([program, *arguments], env=environment, capture_output=True, text=True, timeout=60)
+        return subprocess.run([program, *arguments], env=environment, capture_output=True, text=True, timeout=180)
 
     listed = run("devices", "--json")
     drivers = {d["name"]: d for d in json.loads(listed.stdout)["drivers"]}

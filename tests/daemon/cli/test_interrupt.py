@@ -33,7 +33,7 @@ CAL = {
     "misalignment": [0.006, 0.004, -0.001],
     "bias": [0.005, -0.003, 0.004],
 }
-DEADLINE_S = 20.0
+DEADLINE_S = 180.0
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 
 

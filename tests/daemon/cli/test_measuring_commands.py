@@ -399,7 +399,7 @@ def test_what_is_no_number_is_within_no_limit(capsys: pytest.CaptureFixture[str]
 def test_a_terminal_that_knows_ascii_alone_is_shown_everything(exported: Path) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [Path(sys.executable).with_name("triaxcal"), "fit", exported, "--reference=50", "--reference-unit=µT"]
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=60)
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=180)
     assert done.returncode == 0, done.stderr
     assert b"output/\\xb5T" in done.stdout
     assert b"noise floor " in done.stdout

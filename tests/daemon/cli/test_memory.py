@@ -146,7 +146,7 @@ def limited(mib: int, *arguments: str | Path) -> subprocess.CompletedProcess[str
         [sys.executable, "-m", "triaxcald.cli", *arguments],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=180,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
     )

@@ -204,7 +204,7 @@ def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any,
         stdout=writing,
         stderr=subprocess.PIPE,
         text=True,
-        timeout=60,
+        timeout=180,
     )
     os.close(writing)
     assert done.returncode == 4

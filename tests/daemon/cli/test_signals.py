@@ -58,7 +58,7 @@ def _python(code: str, *arguments: str | Path) -> subprocess.CompletedProcess[st
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=180,
         preexec_fn=_heeding,
     )
 
@@ -338,7 +338,7 @@ def _processor_ticks(process: subprocess.Popen[str]) -> int:
 
 
 def _said(process: subprocess.Popen[str]) -> str:
-    process.wait(timeout=60)
+    process.wait(timeout=180)
     assert process.stderr is not None
     return process.stderr.read()
 
@@ -375,7 +375,7 @@ CHILD = "Path(f'/proc/self/task/{os.getpid()}/children').read_text().split()"
 def test_the_watcher_ends_with_its_process() -> None:
     done = _python(f"print(*{CHILD})")
     assert done.returncode == 0
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 180
     while Path(f"/proc/{int(done.stdout)}").exists():
         assert time.monotonic() < deadline
 

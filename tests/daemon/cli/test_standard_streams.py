@@ -33,7 +33,7 @@ assert descriptor > 2
 def _run(*command: Any, closed: tuple[int, ...] = (), **more: Any) -> subprocess.CompletedProcess[str]:
     streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **more}
     return subprocess.run(
-        list(map(str, command)), preexec_fn=partial(_close, closed), text=True, timeout=60, check=False, **streams
+        list(map(str, command)), preexec_fn=partial(_close, closed), text=True, timeout=180, check=False, **streams
     )
 
 

@@ -89,6 +89,6 @@ print(code, *({"dask", "distributed", "fsspec"} & set(sys.modules)))
     table = ["-o", str(tmp_path / "t.csv")] if command[0] == "batch" else []
     done = subprocess.run(
         [sys.executable, "-c", code, *command, str(tmp_path / "a.mcap"), *table],
-        env=environment(), capture_output=True, text=True, check=True, timeout=120,
+        env=environment(), capture_output=True, text=True, check=True, timeout=180,
     )  # fmt: skip
     assert done.stdout.splitlines()[-1] == "2"

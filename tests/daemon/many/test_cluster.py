@@ -218,7 +218,7 @@ def test_an_interrupted_run_resumes(
     until(lambda: len(_stored(table)) >= 3)
     workers = psutil.Process(client.pid).children(recursive=True)
     os.killpg(client.pid, number) if number == signal.SIGINT else client.kill()  # a terminal tells the whole group
-    _, err = client.communicate(timeout=60)
+    _, err = client.communicate(timeout=180)
     before = _stored(table)
     assert 3 <= len(before) < 24
     if number == signal.SIGINT:

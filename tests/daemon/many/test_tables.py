@@ -81,7 +81,7 @@ table.store(row_of("a"))
 table.store(row_of("b"))
 os.kill(os.getpid(), signal.SIGKILL)
 """
-    done = subprocess.run([sys.executable, "-c", code], env=environment(), check=False, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], env=environment(), check=False, timeout=180)
     assert done.returncode == -signal.SIGKILL
     with pytest.raises(InputError, match="an interrupted run has left it; --resume goes on"):
         opened(path)
@@ -288,7 +288,7 @@ def line(value):
 tables._line = line
 opened(Path({str(path)!r}), resume=True)
 """
-    done = subprocess.run([sys.executable, "-c", code], env=environment(), check=False, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], env=environment(), check=False, timeout=180)
     assert done.returncode == -signal.SIGKILL
     with opened(path, resume=True) as table:
         assert all(table.stored(f"r{i}") == row_of(f"r{i}") for i in range(200))

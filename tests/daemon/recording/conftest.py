@@ -50,7 +50,7 @@ def _block_of(n: int, start_ns: int = T0_NS, period_ns: int = 10_000_000) -> Sam
 
 
 def _wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 180
     while not condition():
         assert time.monotonic() < deadline, "the condition has not come about"
         time.sleep(0.001)

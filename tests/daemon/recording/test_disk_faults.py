@@ -232,7 +232,7 @@ def test_record_ends_with_5_and_says_up_to_when_the_file_is_sound(workshop: Any,
         station = workshop.station({"bus": served.bus})
         done = subprocess.run(
             [sys.executable, "-m", "triaxcald.cli", "record", station, "-o", path],
-            capture_output=True, text=True, timeout=120, check=False,
+            capture_output=True, text=True, timeout=180, check=False,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)),
         )  # fmt: skip

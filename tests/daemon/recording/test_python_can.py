@@ -272,7 +272,7 @@ def tool(tmp_path: Path, environment: dict[str, str]) -> Callable[..., subproces
     def run(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [path_of(name), *arguments],
-            env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
+            env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=180, check=False,
         )  # fmt: skip
 
     return run

@@ -65,7 +65,7 @@ def measured(folder: Path, page: str, width_px: int) -> dict[str, Any]:
     done = subprocess.run(
         [CHROMIUM, *QUIET, f"--user-data-dir={folder / 'profile'}", "--window-size=1400,3000", "--dump-dom",
          file.as_uri()],
-        capture_output=True, text=True, check=True, timeout=120,
+        capture_output=True, text=True, check=True, timeout=180,
     )  # fmt: skip
     text = done.stdout.partition('<pre id="measured">')[2].partition("</pre>")[0]
     found: dict[str, Any] = json.loads(unescape(text))

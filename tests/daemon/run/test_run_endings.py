@@ -78,7 +78,7 @@ def test_a_standard_error_that_is_closed_in_the_check_poses_stops_nothing(worksh
             while b"check poses: " not in said and (more := os.read(reading, 65536)):
                 said += more
             os.close(reading)
-            out, _ = process.communicate(timeout=60)
+            out, _ = process.communicate(timeout=180)
         assert b"check poses: " in said
         assert process.returncode == 0, out
         assert b'"device_state": "new_verified"' in out

@@ -55,7 +55,7 @@ def postgresql() -> Iterator[str]:
 
     def call(program: str, *arguments: str) -> None:
         command = [*who, str(programs / program), *arguments]
-        subprocess.run(command, check=True, capture_output=True, cwd=folder, timeout=120)
+        subprocess.run(command, check=True, capture_output=True, cwd=folder, timeout=180)
 
     data = str(folder / "data")
     options = f"-c listen_addresses=127.0.0.1 -c port={port} -c unix_socket_directories={folder} -c fsync=off"

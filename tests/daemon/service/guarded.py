@@ -144,7 +144,9 @@ async def guarded(
         # A connection that the service is about to end is not used again.
         kept = None if first_s >= 10.0 else 0
         limits = httpx.Limits(max_keepalive_connections=kept)
-        async with httpx.AsyncClient(base_url=base, verify=False, trust_env=False, timeout=30, limits=limits) as client:
+        async with httpx.AsyncClient(
+            base_url=base, verify=False, trust_env=False, timeout=180, limits=limits
+        ) as client:
             yield Guarded(ledger, access, clock, port, client, tls is not None)
     finally:
         server.should_exit = True

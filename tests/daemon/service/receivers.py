@@ -55,7 +55,7 @@ class HttpReceiver:
     def wait(self, count: int) -> None:
         """Until so many requests came."""
         with self._changed:
-            assert self._changed.wait_for(lambda: len(self.got) >= count, timeout=60)
+            assert self._changed.wait_for(lambda: len(self.got) >= count, timeout=180)
 
     @contextmanager
     def listening(self) -> Iterator[HttpReceiver]:

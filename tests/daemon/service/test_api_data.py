@@ -48,7 +48,7 @@ class Data:
         app.include_router(data_router(self))
         answer_errors(app)
         transport = httpx.ASGITransport(Gate(app, self.access), client=(address, 40000))
-        return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8484/api/1", timeout=60)
+        return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8484/api/1", timeout=180)
 
 
 @asynccontextmanager

@@ -32,7 +32,7 @@ def status(
 
 def fetched(port: int, path: str) -> tuple[int, str]:
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=180) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as e:
         return e.code, e.read().decode()
@@ -130,7 +130,7 @@ def test_the_page_shows_what_is_the_matter_and_runs_no_script_of_it(tmp_path: Pa
 
 def test_who_asks_for_the_head_alone_gets_no_body(tmp_path: Path) -> None:
     with served(0, lambda: [status("a")], tmp_path) as port:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=180)
         connection.request("HEAD", "/health")
         answer = connection.getresponse()
         assert (answer.status, answer.read()) == (200, b"")
@@ -139,7 +139,7 @@ def test_who_asks_for_the_head_alone_gets_no_body(tmp_path: Path) -> None:
 
 def test_a_client_that_says_nothing_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("triaxcald.service.supervisor.IDLE_S", 0.05)
-    with served(0, list, tmp_path) as port, socket.create_connection(("127.0.0.1", port), timeout=10) as idle:
+    with served(0, list, tmp_path) as port, socket.create_connection(("127.0.0.1", port), timeout=180) as idle:
         assert idle.recv(1) == b""
 
 
@@ -152,7 +152,7 @@ def test_of_a_client_that_has_gone_nothing_is_said(tmp_path: Path, capfd: pytest
         return [status("a")]
 
     with served(0, late, tmp_path) as port:
-        client = socket.create_connection(("127.0.0.1", port), timeout=10)
+        client = socket.create_connection(("127.0.0.1", port), timeout=180)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
         client.sendall(b"GET /health HTTP/1.0\r\n\r\n")
         assert asked.wait(10)

@@ -27,14 +27,14 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 def health(stage: Stage) -> tuple[int, dict[str, Any]]:
     try:
-        with urllib.request.urlopen(f"{stage.url}/health", timeout=10) as answer:
+        with urllib.request.urlopen(f"{stage.url}/health", timeout=180) as answer:
             return answer.status, json.loads(answer.read())
     except urllib.error.HTTPError as e:
         return e.code, json.loads(e.read())
 
 
 def losses(stage: Stage) -> float:
-    with urllib.request.urlopen(f"{stage.url}/metrics", timeout=10) as answer:
+    with urllib.request.urlopen(f"{stage.url}/metrics", timeout=180) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     (found,) = [s.value for family in families for s in family.samples if s.name == "triaxcal_database_losses_total"]
     return found

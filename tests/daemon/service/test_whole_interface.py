@@ -39,7 +39,7 @@ async def served(station: Station) -> AsyncIterator[httpx.AsyncClient]:
     service = StationService(floor, ledger, access, Outbox(ledger, station))
     transport = httpx.ASGITransport(Gate(app_of(service), access))
     try:
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8484", timeout=60) as client:
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8484", timeout=180) as client:
             yield client
     finally:
         await floor.end()

@@ -382,7 +382,7 @@ async def test_a_unit_in_another_process_is_reached_over_udp_multicast(bundle: B
             assert await device.read("serial_number") == bytes([77, 0, 0, 0])
             batches = await frames_of(device, 80)
     finally:
-        served.communicate(timeout=5)
+        served.communicate(timeout=180)
     decoder = CanDriver().decoder(bundle, "readings")
     readings = np.concatenate([decoder.feed(batch).readings for batch in batches])
     assert len(readings) >= 15

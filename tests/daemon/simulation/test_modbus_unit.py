@@ -30,7 +30,7 @@ from triaxcald.simulation.unit import CALIBRATION, COVERED, TABLE, Faults, Refer
 
 TEXT = (BUILT_IN / "triax-ref-modbus.toml").read_text("utf-8")
 LOOPBACK = TcpAddress("127.0.0.1", 0)
-PATIENCE_S, SILENCE_S = 5.0, 0.05
+PATIENCE_S, SILENCE_S = 180.0, 0.05
 UNLOCK = "0009 0000 0009 01 10 0010 0001 02 5A17"
 UNLOCKED = "0009 0000 0006 01 10 0010 0001"
 

@@ -485,7 +485,7 @@ for _ in range(5):
         process.stdin.flush()
     expected = [600, sum(d["work"]["serial"] == serial for d in documents)]
     for process in processes:
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=180)
         assert (process.returncode, err) == (0, "")
         assert [json.loads(line) for line in out.splitlines()] == [expected] * 5
     assert len(ask(tmp_path).rows) == 600

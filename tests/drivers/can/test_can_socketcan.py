@@ -242,7 +242,7 @@ def test_closing_ends_the_wait_of_another_thread(ends: tuple[SocketCan, socket.s
     waiting = threading.Thread(target=adapter.receive, args=(3600.0,))
     waiting.start()
     adapter.close()
-    waiting.join(timeout=30)
+    waiting.join(timeout=180)
     assert not waiting.is_alive()
     with pytest.raises(BusError, match="socketcan can7 has been closed"):
         adapter.receive(0.0)

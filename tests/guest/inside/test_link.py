@@ -71,7 +71,7 @@ def test_whoever_waits_is_told_at_once(vcan: str, opened: Callable[..., Any]) ->
         waiting = threading.Thread(target=wait, args=(adapter,))
         waiting.start()
         end(adapter)
-        waiting.join(timeout=30)
+        waiting.join(timeout=180)
         assert not waiting.is_alive()
     assert "the link is down" in told[0]
     assert told[1] == "[]" or "has been closed" in told[1]

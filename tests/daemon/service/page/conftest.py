@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from tests.daemon.service.page.stage import Stage, station_file
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PATIENCE_MS = 180_000
+"""A busy machine is no fault of the page."""
+expect.set_options(timeout=PATIENCE_MS)
 QUIET = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -51,7 +54,7 @@ def opened(browser: Browser, stage: Stage) -> Iterator[Opened]:
         context = browser.new_context(**({"locale": "en-GB", "viewport": {"width": 1280, "height": 800}} | settings))
         contexts.append(context)
         page = context.new_page()
-        page.set_default_timeout(15000)
+        page.set_default_timeout(PATIENCE_MS)
         page.on("pageerror", lambda e: troubles.append(str(e)))
         page.on("console", lambda m: "Content Security Policy" in m.text and troubles.append(m.text))
         page.goto(stage.url + path)

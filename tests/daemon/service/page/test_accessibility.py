@@ -53,7 +53,7 @@ def test_the_operators_page(stage: Stage, opened: Opened, name: str, theme: str)
         expect(page.locator("#error")).to_be_visible()
     if name == "stale":
         go_on = stage.hang()
-        expect(page.locator("#stale")).to_be_visible(timeout=8000)
+        expect(page.locator("#stale")).to_be_visible()
         page.evaluate("document.body.classList.remove('stale')")  # grey on purpose: it is not to be read
         assert serious(page) == []
         go_on.set()

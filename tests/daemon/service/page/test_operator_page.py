@@ -311,7 +311,7 @@ def test_nothing_is_wider_than_the_page(stage: Stage, opened: Opened, size: tupl
     page = opened(f"/?lang={language}", viewport={"width": size[0], "height": size[1]})
     expect(page.locator(".card .big")).to_have_count(4)
     # The verdicts get their size once the cards have theirs.
-    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=size[0], timeout=5000)
+    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=size[0])
     boxes = page.eval_on_selector_all(
         ".card, .card .big b, .task h2, .command button, .command input",
         "all => all.map(e => [e.outerHTML, e.getBoundingClientRect().right])",
@@ -365,7 +365,7 @@ def test_a_page_without_a_network_catches_up(stage: Stage, opened: Opened) -> No
     expect(page.locator("#task-title")).to_have_text("Edge A/Lid up")
     page.context.set_offline(True)
     page.evaluate("window.stop()")  # ends the connections that are open
-    expect(page.locator("#stale")).to_be_visible(timeout=8000)
+    expect(page.locator("#stale")).to_be_visible()
     for slot in "abc":
         stage.finish(slot)
     stage.poses("d", 9)
@@ -400,7 +400,7 @@ def test_a_restarted_service_is_found_again_and_nothing_scanned_is_lost(stage: S
     page = opened()
     expect(page.locator(".card.scanned")).to_have_count(2)
     stage.end()
-    expect(page.locator("#stale")).to_be_visible(timeout=8000)
+    expect(page.locator("#stale")).to_be_visible()
     scan(page, "SN-9")
     expect(page.locator("#error")).to_contain_text("The station did not answer.")
     stage.begin()

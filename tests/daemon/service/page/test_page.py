@@ -137,7 +137,7 @@ def test_a_trace_has_the_readings_and_their_poses(stage: Stage, client: httpx.Cl
     with_recording, without = (outcome["run"] for outcome in written(folder)[:2])
     (folder / "run-000.mcap").write_bytes((RECORDINGS / "can-second-order.mcap").read_bytes())
     stage.ledger.take()
-    trace = client.get(f"/runs/{with_recording}/trace", timeout=60).json()
+    trace = client.get(f"/runs/{with_recording}/trace", timeout=180).json()
     assert trace["unit"] == "V"
     assert len(trace["poses"]) == 27
     assert len(trace["t_s"]) <= 1500

@@ -116,7 +116,7 @@ def test_a_run_shows_figures_documents_trace_and_events(
     for name, end in (("Report", "report"), ("Outcome (JSON)", "outcome"), ("Recording", "recording")):
         expect(page.get_by_role("link", name=name)).to_have_attribute("href", f"/api/1/runs/{run}/{end}")
     expect(page.get_by_role("link", name="Certificate")).to_have_count(0)
-    expect(page.locator("figure .chart .span")).to_have_count(27, timeout=60000)
+    expect(page.locator("figure .chart .span")).to_have_count(27)
     expect(page.locator("figure .chart path")).to_have_count(3)
     events = page.locator("section", has=page.get_by_role("heading", name="Events")).locator("tr td:last-child")
     assert events.all_inner_texts() == [
