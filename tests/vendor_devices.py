@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import can
@@ -36,16 +37,20 @@ def acceleration(seconds: float) -> list[float]:
     return [(1 - part) * a + part * b for a, b in zip(direction(int(number)), direction(int(number) + 1), strict=True)]
 
 
+def _since(begun_s: float) -> float:
+    return time.monotonic() - begun_s
+
+
 @dataclass
 class Sensor:
-    """Three axes with errors, in g."""
+    """Three axes with errors, in g. ``age_s`` is the time by which it turns, by default the real one."""
 
+    age_s: Callable[[], float] = field(default_factory=lambda: partial(_since, time.monotonic()))
     noise: random.Random = field(default_factory=lambda: random.Random(1))
-    begun_s: float = field(default_factory=time.monotonic)
 
     def output_g(self, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[float]:
         """What it shows now, ``offset`` subtracted as by its registers."""
-        x, y, z = acceleration(time.monotonic() - self.begun_s)
+        x, y, z = acceleration(self.age_s())
         mx, my, mz = MISALIGNMENT
         sensed = (x + mz * y + my * z, y + mx * z, z)
         return [
@@ -59,14 +64,16 @@ Frames = list[tuple[int, bool, bytes]]
 
 
 class Sender(can.Listener):
-    """A device on a virtual CAN bus of this process that sends ``cycle(number)`` a hundred times a second.
-    ``commands`` are the frames that it hears."""
+    """A device on a virtual CAN bus of this process that sends ``cycle(number)`` a hundred times a second, or less
+    often on a busy machine: it turns by its samples, so that each pose has as many. ``commands`` are the frames that it
+    hears."""
 
     PERIOD_S = 0.01
 
     def __init__(self, channel: str) -> None:
         self.commands: list[bytes] = []
-        self.sensor, self.sent = Sensor(), 0
+        self.sent = 0
+        self.sensor = Sensor(lambda: self.sent * self.PERIOD_S)
         self._bus = can.Bus(channel, interface="virtual")
         self._notifier = can.Notifier(self._bus, [self])
         self._stop = threading.Event()
@@ -87,7 +94,7 @@ class Sender(can.Listener):
         while not self._stop.wait(max(next_s - time.monotonic(), 0)):
             for identifier, extended, data in self.cycle(number):
                 self._bus.send(can.Message(arbitration_id=identifier, is_extended_id=extended, data=data))
-            number, next_s = number + 1, next_s + self.PERIOD_S
+            number, next_s = number + 1, max(next_s + self.PERIOD_S, time.monotonic())
             self.sent = number
 
     def __enter__(self) -> Sender:

@@ -15,12 +15,12 @@ from scipy.optimize import least_squares
 
 from tests import vendor_devices as vendors
 from tests.canopen_node import MappedNode
-from tests.vendor_devices import Sensor
+from tests.vendor_devices import Sender, Sensor
 from triaxcal_drivers.catalogue import BUILT_IN
 
 pytestmark = pytest.mark.slow
 Run = Callable[..., Any]
-PLAN = {"poses": 14, "hold_s": 0.6, "check_poses": 3, "comes_back_s": 1.0, "patience_s": 60.0}
+PLAN = {"poses": 14, "hold_s": 0.6, "check_poses": 3, "comes_back_s": 60.0, "patience_s": 300.0}
 ON_CAN = {
     "witmotion-can": vendors.WitMotionCan,
     "bosch-mm710": vendors.BoschMm710,
@@ -33,8 +33,8 @@ TMM61_AS_DELIVERED = {(0x1800, 2): 1, (0x1800, 5): 0, (0x1A00, 0): 2, (0x1A00, 1
 
 
 def node(channel: str, number: int, profile: str, per_g: float, first: tuple[int, int], **more: Any) -> MappedNode:
-    """A CANopen node with three accelerations from object ``first`` on."""
-    sensor = Sensor()
+    """A CANopen node with three accelerations from object ``first`` on. It turns by its samples."""
+    sensor = Sensor(lambda: unit.sent * Sender.PERIOD_S)
     held: dict[str, list[float]] = {}
 
     def value_of(index: int, subindex: int, _: float) -> int:
@@ -45,7 +45,8 @@ def node(channel: str, number: int, profile: str, per_g: float, first: tuple[int
             held["g"] = sensor.output_g()
         return round(per_g * held["g"][axis])
 
-    return MappedNode(channel, number, BUILT_IN / f"{profile}.eds", value_of, **more)
+    unit = MappedNode(channel, number, BUILT_IN / f"{profile}.eds", value_of, **more)
+    return unit
 
 
 def require_truth(profile: str, outcome: Mapping[str, Any], offset_g: float = 0.0) -> None:
