@@ -166,4 +166,5 @@ def _poses_in(c: schema.Calibration, mounting: Floats | None) -> SeenPoses | Non
         table[:, :3], table[:, 3], table[:, 4],
         measured @ turn.T if known else None,
         plan[cosine.argmax(axis=1)] @ turn.T if known else None,
+        mounting,
     )  # fmt: skip

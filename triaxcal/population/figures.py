@@ -9,7 +9,7 @@ a shift of a place, or a slow drift, does not widen them.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -31,6 +31,13 @@ OCTAVES = 12
 FINEST = 4.0
 """Steps of a converter in the shortest period: the mean of a pose averages shorter
 ones."""
+ONE_KIND = 1e-3
+"""Relative difference of steps of one kind of converter, which rounding of outputs
+leaves."""
+REWEIGHTED = 50
+"""Rounds of reweighted least squares: the sum of distances has settled long before."""
+SMALLEST_RAD = 1e-5
+"""Distances below count alike: no fixture is as good."""
 TAILS = 6.0
 """Degrees of freedom of Student's t for the spread between units, which has heavier
 tails than a normal one."""
@@ -116,9 +123,37 @@ def _directions(runs: Sequence[UnitRun]) -> Iterator[Group]:
             values[i] = inverse @ np.cross(p, m).sum(axis=0)
             rest = m - p - np.cross(values[i], p)
             errors[i] = np.sqrt(np.diag(inverse) * np.sum(rest**2) / max(2 * len(p) - 3, 1))
+    values = _of_places(values, runs)
     if np.isfinite(values).any():
         names = ("rotation.x", "rotation.y", "rotation.z")
         yield Group(FigureKind.DIRECTIONS, "directions", names, ("rad",) * 3, values, errors)
+
+
+def _of_places(rotations: Floats, runs: Sequence[UnitRun]) -> Floats:
+    """Rotations (N,3) along the axes of the fixture without the tilt that units of the
+    type share in their housings, which turns with the mounting. NaN where the mounting
+    is not known while units stand differently."""
+    aligned = np.eye(3)
+    mountings = [None if run.poses is None else run.poses.mounting for run in runs]
+    if all(m is None or np.array_equal(m, aligned) for m in mountings):
+        return rotations
+    known = np.array([m is not None for m in mountings]) & np.isfinite(rotations).all(axis=1)
+    turns = np.array([aligned if m is None else m for m in mountings], dtype=float)
+    found = np.where(known[:, None], rotations, np.nan)
+    if not known.any():
+        return found
+    # r = f + M t with the least sum of |r - f - M t|: a bent place of a minority counts
+    # little. Where all stand alike, f and t are one, and what t has is constant.
+    both = np.concatenate([np.broadcast_to(aligned, turns.shape), turns], axis=2)[known]
+    target = rotations[known]
+    weight = np.ones(len(target))
+    solution = np.zeros(6)
+    for _ in range(REWEIGHTED):
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq((both * root[:, :, None]).reshape(-1, 6), (target * root).ravel(), rcond=None)[0]
+        left = np.linalg.norm(target - both @ solution, axis=1)
+        weight = 1 / np.maximum(left, SMALLEST_RAD)
+    return np.asarray(found - turns @ solution[3:])
 
 
 def _residuals(runs: Sequence[UnitRun]) -> Iterator[Group]:
@@ -191,10 +226,11 @@ def _harmonics(a: Floats) -> Floats:
 
 def _periods(runs: Sequence[UnitRun]) -> tuple[float, ...]:
     """Periods of the bits of the commonest converter, the longest first."""
-    known = Counter(run.resolution for run in runs if run.resolution is not None and run.resolution > 0)
-    if not known:
+    known = np.sort([run.resolution for run in runs if run.resolution is not None and run.resolution > 0])
+    if not len(known):
         return ()
-    (step, _), *_ = known.most_common(1)
+    kinds = np.split(known, np.flatnonzero(known[1:] > known[:-1] * (1 + ONE_KIND)) + 1)
+    step = float(np.median(max(kinds, key=len)))
     span = float(np.median([np.ptp(run.poses.readings) for run in runs if run.poses is not None]))
     largest = int(np.ceil(np.log2(max(span / step, 1.0))))
     exponents = range(largest, max(largest - OCTAVES, 0), -1)

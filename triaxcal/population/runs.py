@@ -55,17 +55,23 @@ class SeenPoses:
     ``standard_error`` (n,) from noise in g. ``measured`` (n,3) are directions of the
     calibrated vector in the unit's frame, ``planned`` (n,3) those that the plan asked
     for; both along the axes of the fixture, so that what the fixture does is the same
-    for units that stand in it differently. Raises InvalidData for other shapes."""
+    for units that stand in it differently. ``mounting`` (3,3) has turned them there
+    from the unit's axes; without it they are along those. Raises InvalidData for other
+    shapes."""
 
     readings: Floats
     residual: Floats
     standard_error: Floats
     measured: Floats | None = None
     planned: Floats | None = None
+    mounting: Floats | None = None
 
     def __post_init__(self) -> None:
         n = len(self.residual)
-        for name, shape in (("readings", (n, 3)), ("standard_error", (n,)), ("measured", (n, 3)), ("planned", (n, 3))):
+        for name, shape in (
+            ("readings", (n, 3)), ("standard_error", (n,)), ("measured", (n, 3)), ("planned", (n, 3)),
+            ("mounting", (3, 3)),
+        ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and np.shape(value) != shape:
                 raise InvalidData(f"{name} of poses: expected shape {shape}, not {np.shape(value)}")

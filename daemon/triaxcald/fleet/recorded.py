@@ -3,6 +3,7 @@ converter, and how the unit was mounted."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,23 +22,24 @@ from triaxcald.recording.schema import CALIBRATION, STATION_FILE
 from triaxcald.station.config import parse_station
 
 SAMPLES: Final = 5000
-"""Samples from which a step is told: the noise of a pose or two visits neighbouring
-codes many times."""
+"""Samples from which a step is told, and the rest of their batch: the noise of a pose
+or two visits neighbouring codes many times."""
 CODES_LEAST: Final = 8
-"""Steps between codes that have to agree: fewer may be multiples of one by chance."""
-CODES_MOST: Final = 2**24
-"""Steps across the readings: floating-point outputs have more, and no converter."""
-WHOLE: Final = 1e-3
-"""How far from a whole number of steps codes may be, in steps."""
-DIGITS: Final = 10
-"""Significant digits of a step: units with one kind of converter have the same."""
+"""Differences between codes that have to agree: fewer may be multiples by chance."""
+CODES_MOST: Final = 2**23
+"""Steps from zero to the largest reading: those of a signed converter of 24 bits.
+Floating-point outputs without a converter's step have more."""
+WHOLE: Final = 0.05
+"""How far from a whole number of steps codes may be, in steps: single precision rounds
+them."""
+UNREADABLE: Final = (DaemonError, td.DriverError, OSError)
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """``mounting`` (3,3) turns directions along the unit's axes to those of the
-    fixture. ``resolution`` is one step of the converter in output units. None of what
-    is not known."""
+    fixture. ``resolution`` is one step of the readings in output units: of the
+    converter if the unit does not round coarser. None of what is not known."""
 
     mounting: tc.Floats | None = None
     resolution: float | None = None
@@ -46,11 +48,13 @@ class Recorded:
 def recorded_in(path: Path, slot: str | None) -> Recorded:
     """Of the unit in ``slot``. A recording that cannot be read tells nothing: what is
     wrong with it is the concern of `audit`."""
-    try:
-        with Recording.open(path) as recording:
-            return Recorded(_mounting(recording, slot), _resolution(recording))
-    except (DaemonError, td.DriverError, OSError):
-        return Recorded()
+    mounting, resolution = None, None
+    with suppress(*UNREADABLE), Recording.open(path) as recording:
+        with suppress(*UNREADABLE):
+            mounting = _mounting(recording, slot)
+        with suppress(*UNREADABLE):
+            resolution = _resolution(recording)
+    return Recorded(mounting, resolution)
 
 
 def _mounting(recording: Recording, slot: str | None) -> tc.Floats | None:
@@ -66,7 +70,10 @@ def _mountings(station: bytes) -> dict[str, tc.Floats]:
 
 
 def _resolution(recording: Recording) -> float | None:
-    stream = DecodedStream(bundle_of(recording), td.READINGS)
+    bundle = bundle_of(recording)
+    if bundle.profile.reads_corrected:  # the correction spreads the codes
+        return None
+    stream = DecodedStream(bundle, td.READINGS)
     blocks: list[tc.Floats] = []
     for batch in recording.raw(CALIBRATION):
         blocks.append(stream.rising(batch).readings)
@@ -76,16 +83,23 @@ def _resolution(recording: Recording) -> float | None:
 
 
 def step_of(readings: tc.Floats) -> float | None:
-    """The step of the converter behind ``readings`` (n,3): all differences between
-    codes of an axis are whole multiples of it. None if there is no such step."""
+    """The step behind ``readings`` (n,3): all differences between codes of an axis are
+    whole multiples of it. None if there is no such step."""
     codes = [np.unique(axis) for axis in readings.T]
-    between = np.concatenate([np.diff(of) for of in codes])
+    between = np.sort(np.concatenate([np.diff(of) for of in codes]))
     if len(between) < CODES_LEAST:
         return None
-    # The smallest difference has the rounding of two codes; the widest span has little.
-    step, span = float(between.min()), max(float(of[-1] - of[0]) for of in codes)
-    if np.abs(readings).max() >= CODES_MOST * step:
-        return None
-    step = span / np.rint(span / step)
+    # Each difference, the smallest first, makes the step more precise for the next.
+    total = count = 0.0
+    step = float(between[0])
+    for difference in between.tolist():
+        total += difference
+        count += round(difference / step)
+        step = total / count
+    # The widest span of all has the least rounding.
+    span = max(float(of[-1] - of[0]) for of in codes)
+    step = span / round(span / step)
     steps = between / step
-    return float(f"{step:.{DIGITS}g}") if np.abs(steps - np.rint(steps)).max() <= WHOLE else None
+    if np.abs(readings).max() > CODES_MOST * step or np.abs(steps - np.rint(steps)).max() > WHOLE:
+        return None
+    return step

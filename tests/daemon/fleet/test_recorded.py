@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,17 @@ def test_step_of_a_converter(seed: int, factor: float, codes: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_floating_point_outputs_have_no_step(seed: int, kind: type[np.floating[Any]]) -> None:
-    assert step_of(readings(np.random.default_rng(seed), 3.0).astype(kind).astype(float) / 1e4) is None
+@pytest.mark.parametrize("offset", [0.0, 2.5, 12.0])  # around the last two, single precision has one spacing
+def test_floating_point_outputs_have_no_step(seed: int, kind: type[np.floating[Any]], offset: float) -> None:
+    values = readings(np.random.default_rng(seed), 3.0) / 4e4 + offset
+    assert step_of(values.astype(kind).astype(float)) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("factor", [10 / 2**16, 9.80665 / 16384])
+def test_step_of_a_converter_behind_single_precision(seed: int, factor: float) -> None:
+    whole = np.rint(readings(np.random.default_rng(seed), 3.0)) + 32768
+    assert step_of((whole * factor).astype(np.float32).astype(float)) == pytest.approx(factor, rel=1e-5)
 
 
 def test_few_codes_have_no_step() -> None:
@@ -107,11 +117,13 @@ def fleet_of(folder: Path, in_slot_b: str, poses_of: Callable[[dict[str, Any], P
         papers.append(copy.deepcopy(paper))
         poses_of(document, papers[-1]["result"]["calibration"]["poses"], rng)
     write(folder, documents, papers)
+    golden = folder / "golden.mcap"
+    shutil.copy(GOLDEN / "can-second-order.mcap", golden)
     turned = mounted(folder / "turned.mcap", in_slot_b)
     for document in documents:
-        made = turned if document["unit"] == "b" else GOLDEN / "can-second-order.mcap"
-        (folder / document["recording"]).hardlink_to(made)
+        (folder / document["recording"]).hardlink_to(turned if document["unit"] == "b" else golden)
     turned.unlink()
+    golden.unlink()
     return folder
 
 
@@ -152,3 +164,34 @@ def test_effect_of_a_place_that_recordings_make_visible(
     assert (found["kind"], found["place"], found["verdict"]) == (kind, place, "named")
     assert figure in found["figure"]
     assert {of["place"] for of in product["places"]} == {place}  # one effect may leave a second pattern there
+
+
+def bent(pose: dict[str, Any], mounting: np.ndarray, rng: Generator, fixture: float, unit: float) -> None:
+    """A pose in a fixture bent about its x axis, of a sensor tilted in its housing about its own x axis."""
+    held = Rotation.from_rotvec(rng.normal(0, 0.002, 3)) * Rotation.from_euler("x", fixture)
+    own = Rotation.from_euler("x", unit).as_matrix()
+    pose["direction"] = [float(v) for v in own @ mounting.T @ held.as_matrix() @ mounting @ pose["direction"]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fixture", "unit", "lost"), [(0.02, 0.02, ""), (0.02, 0.0, "first half"), (0.0, 0.02, "line1")]
+)
+def test_what_all_units_and_fixtures_share_is_no_effect_of_a_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fixture: float, unit: float, lost: str
+) -> None:
+    """Also where a part of the recordings is lost: the mounting of these runs is not known."""
+
+    def poses_of(document: dict[str, Any], poses: Poses, rng: Generator) -> None:
+        mounting = rotation(TURNED) if document["unit"] == "b" else np.eye(3)
+        for pose in poses:
+            bent(pose, mounting, rng, fixture, unit)
+
+    folder = fleet_of(tmp_path / "runs", TURNED, poses_of)
+    paths = sorted(folder.glob("*.mcap"))
+    for i, path in enumerate(paths):
+        if (lost == "first half" and i < 40) or (lost == "line1" and i % 2 == 0):
+            path.unlink()
+    assert main(["fleet", str(folder), "--json"]) == 0
+    (product,) = json.loads(capsys.readouterr().out)["products"]
+    assert [place["text"] for place in product["places"]] == []
