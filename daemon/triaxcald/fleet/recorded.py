@@ -87,7 +87,7 @@ def step_of(readings: tc.Floats) -> float | None:
     whole multiples of it. None if there is no such step."""
     codes = [np.unique(axis) for axis in readings.T]
     between = np.sort(np.concatenate([np.diff(of) for of in codes]))
-    if len(between) < CODES_LEAST:
+    if len(between) < CODES_LEAST or np.abs(readings).max() > 2 * CODES_MOST * between[0]:
         return None
     # Each difference, the smallest first, makes the step more precise for the next.
     total = count = 0.0

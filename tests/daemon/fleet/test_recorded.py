@@ -57,6 +57,11 @@ def test_step_of_a_converter_behind_single_precision(seed: int, factor: float) -
     assert step_of((whole * factor).astype(np.float32).astype(float)) == pytest.approx(factor, rel=1e-5)
 
 
+def test_rubbish_has_no_step() -> None:
+    values = np.random.default_rng(1).uniform(-1, 1, (600, 3)) * np.logspace(-320, 99, 600)[:, None]
+    assert step_of(values) is None
+
+
 def test_few_codes_have_no_step() -> None:
     assert step_of(np.tile([[0.0, 5.0, 10.0], [5.0, 5.0, 15.0]], (300, 1))) is None
 
